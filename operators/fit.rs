@@ -442,10 +442,15 @@ mod tests {
                 assert!(format!("{message}: {help}").contains(expected), "{message}: {help}");
             }
         }
+        // The graph of a live hand promises what its model does, in tenths of a percent.
+        let model = Model::load(Path::new(&project(LIFTS))).expect("a model");
+        let own = (1000.0 * most_drops(&model, "test_lifted").expect("a bound")).ceil() / 1000.0;
+        let live = std::fs::read_to_string(project("dataflow-live.yaml")).expect("a file");
+        assert!(live.contains(&format!("promised_drops: ${{PROMISED_DROPS:-{own}}}")), "{own}");
         // A model without a test lift.
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("settled.json");
-        let mut model = Model::load(Path::new(&project(LIFTS))).expect("a model");
+        let mut model = model;
         model.test_lifted = None;
         model.training.policies.retain(|policy| policy.look == "settled");
         model.save(&path).expect("saved");

@@ -25,6 +25,7 @@ struct Params {
     max_age_ms: f64,
     probe: Probe,
     promised_drops: f64,
+    lifts_per_object: u32,
 }
 
 pub(crate) fn describe() -> OperatorDescription {
@@ -44,7 +45,8 @@ pub(crate) fn describe() -> OperatorDescription {
             "min_probability_stable",
             share.clone(),
             Some(default.min_probability_stable.into()),
-            "The least probability that counts as stable, in addition to the model's own threshold",
+            "The least probability that counts as stable, in place of the model's own threshold; 0 keeps the model's. Below that \
+             the model's bound on drops does not hold",
         )
         .live_param(
             "max_gap_ms",
@@ -73,6 +75,13 @@ pub(crate) fn describe() -> OperatorDescription {
             "The promised share of the lifts that drop the object: if frames of the phases kept and dropped refute it, every grasp \
              is held until this is set to another value; 1 promises nothing",
         )
+        .live_param(
+            "lifts_per_object",
+            ParamKind::Integer { min: Some(1), max: Some(100) },
+            Some(default.lifts_per_object.into()),
+            "How many times in a row the robot lifts an object at most: so many outcomes count once in the bound of this robot's \
+             drops; 1 for objects in random order",
+        )
 }
 
 /// The mistakes with which [`work`] would fail at once.
@@ -94,6 +103,7 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
         decided: Vec::new(),
         ended: EndedPromises::default(),
         reported: Default::default(),
+        has_said_loosened: false,
     };
     stage::run(operator, "prediction", "decision", 0, BTreeMap::new(), stage)
 }
@@ -107,6 +117,7 @@ impl Params {
             max_age_nanos: (self.max_age_ms * 1e6) as u64,
             probe: self.probe,
             promised_drops: self.promised_drops,
+            lifts_per_object: self.lifts_per_object,
             ..ArbiterOptions::default()
         }
     }
@@ -125,6 +136,8 @@ struct Arbiter {
     ended: EndedPromises,
     /// The outcomes that are counted in the node's status, and the number of lifts without one.
     reported: (PromiseMonitor, u64),
+    /// Whether it has said that its threshold is below the model's.
+    has_said_loosened: bool,
 }
 
 /// The outcomes of lifts under promises that another one has replaced.
@@ -151,6 +164,16 @@ impl Stage for Arbiter {
                 // The clock of a frame from the future cannot be trusted: the frame counts as infinitely old.
                 let age_nanos = now_nanos.checked_sub(head.header.origin_nanos).unwrap_or(u64::MAX);
                 self.arbiter.on_prediction(&head.header, &prediction, age_nanos, &mut self.decided);
+                if !self.has_said_loosened && self.arbiter.options().loosens(&prediction) {
+                    self.has_said_loosened = true;
+                    tracing::warn!(
+                        grasp_id = head.grasp_id,
+                        "min_probability_stable ({}) is below the threshold of the model, which does not call a grasp of probability \
+                         {:.3} stable: the model's bound on drops does not hold",
+                        self.arbiter.options().min_probability_stable,
+                        prediction.probability_stable
+                    );
+                }
             }
             Err(error) => {
                 tracing::warn!(seq = head.header.seq, "a prediction cannot be read: {error}");
@@ -227,6 +250,7 @@ impl Stage for Arbiter {
     fn set(&mut self, params: &Map<String, Value>) -> anyhow::Result<()> {
         let options = parse_params::<Params>(params)?.options();
         let promise = self.arbiter.state().promise().clone();
+        self.has_said_loosened = false;
         self.arbiter.set_options(options);
         self.has_replaced(&promise);
         self.report();
@@ -253,8 +277,10 @@ impl Arbiter {
         }
         let (n_kept, n_dropped) = (promise.n_kept, promise.n_dropped);
         let [kept_since_change, dropped_since_change] = promise.since_change();
+        let ArbiterOptions { promised_drops, lifts_per_object, .. } = *self.arbiter.options();
+        let drops_at_most_ppm = (1e6 * promise.drops_at_most(lifts_per_object)).ceil() as u64;
         if promise.is_withdrawn() && !self.reported.0.is_withdrawn() {
-            let promised = 100.0 * self.arbiter.options().promised_drops;
+            let promised = 100.0 * promised_drops;
             tracing::warn!(
                 "more lifts drop the object than the promised {promised} %: {n_dropped} of {} that were reported, the last ones \
                  most often; every grasp is held until promised_drops is set to another value",
@@ -265,13 +291,15 @@ impl Arbiter {
             tracing::warn!(
                 "lifts seem to drop the object more often than the promised {} %: {n_dropped} of {} that were reported; if this \
                  goes on, every grasp will be held",
-                100.0 * self.arbiter.options().promised_drops,
+                100.0 * promised_drops,
                 n_kept + n_dropped
             );
         }
         self.operator.has_counted_in_all(BTreeMap::from([
             (OUTCOME_COUNTS[0].into(), kept_since_change),
             (OUTCOME_COUNTS[1].into(), dropped_since_change),
+            (OUTCOME_COUNTS[2].into(), drops_at_most_ppm),
+            (OUTCOME_COUNTS[3].into(), lifts_per_object.into()),
             ("lifts/kept".into(), self.ended.n_kept + n_kept),
             ("lifts/dropped".into(), self.ended.n_dropped + n_dropped),
             ("lifts/unreported".into(), state.n_unreported()),

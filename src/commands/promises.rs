@@ -6,7 +6,7 @@ use std::fmt;
 use serde::Serialize;
 
 use blindgrasp_graph::client::words;
-use blindgrasp_stages::promise_monitor::{CONFIDENCE, OUTCOME_COUNTS, drops_at_most};
+use blindgrasp_stages::promise_monitor::{CONFIDENCE, OUTCOME_COUNTS};
 
 /// The bound that the reported lifts of a robot allow, since `promised_drops` was set and the readings changed.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
@@ -16,26 +16,41 @@ pub(super) struct RobotPromise {
     /// At most this share of the lifts drops the object.
     drops_at_most: f64,
     confidence: f64,
+    /// This holds if no object is lifted more often in a row.
+    lifts_per_object: u64,
 }
 
 impl RobotPromise {
     /// The promise of a node that counts outcomes; `None` of others, and before the first outcome.
     pub(super) fn of(counts: &BTreeMap<String, u64>) -> Option<RobotPromise> {
-        let [n_kept, n_dropped] = OUTCOME_COUNTS.map(|name| counts.get(name).copied().unwrap_or(0));
-        let drops_at_most = drops_at_most(n_kept, n_dropped);
-        (n_kept + n_dropped > 0).then_some(RobotPromise { n_kept, n_dropped, drops_at_most, confidence: CONFIDENCE })
+        let [n_kept, n_dropped, ppm, lifts_per_object] =
+            OUTCOME_COUNTS.map(|name| counts.get(name).copied().unwrap_or(0));
+        if n_kept + n_dropped == 0 {
+            return None;
+        }
+        Some(RobotPromise {
+            n_kept,
+            n_dropped,
+            drops_at_most: ppm as f64 / 1e6,
+            confidence: CONFIDENCE,
+            lifts_per_object,
+        })
     }
 }
 
 impl fmt::Display for RobotPromise {
     fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let RobotPromise { n_kept, n_dropped, drops_at_most, confidence } = self;
+        let RobotPromise { n_kept, n_dropped, drops_at_most, confidence, lifts_per_object } = self;
         let n_lifts = n_kept + n_dropped;
+        let condition = if *lifts_per_object == 1 {
+            "objects come in random order".to_owned()
+        } else {
+            format!("no object is lifted more than {lifts_per_object} times in a row")
+        };
         let (most, confidence) = (100.0 * drops_at_most, 100.0 * confidence);
         write!(
             formatter,
-            "at most {most:.1} % of this robot's lifts drop ({confidence:.0} % confidence if objects come in random order; {n_dropped} of \
-             {n_lifts} did)"
+            "at most {most:.1} % of this robot's lifts drop ({confidence:.0} % confidence if {condition}; {n_dropped} of {n_lifts} did)"
         )
     }
 }
@@ -52,16 +67,19 @@ mod tests {
 
     #[test]
     fn a_promise_needs_outcomes() {
-        let counts =
-            |kept, dropped| BTreeMap::from([("promise/kept".into(), kept), ("promise/dropped".into(), dropped)]);
+        let counts = |kept, dropped, ppm, lifts_per_object| {
+            let numbers = [kept, dropped, ppm, lifts_per_object];
+            OUTCOME_COUNTS.into_iter().map(String::from).zip(numbers).collect::<BTreeMap<_, _>>()
+        };
         assert_eq!(RobotPromise::of(&BTreeMap::from([("lifts/kept".into(), 7)])), None);
-        assert_eq!(RobotPromise::of(&counts(0, 0)), None);
-        assert_eq!(shown_counts(&counts(0, 0)), Vec::<String>::new());
-        let shown = shown_counts(&counts(294, 6));
+        assert_eq!(RobotPromise::of(&counts(0, 0, 1_000_000, 5)), None);
         assert_eq!(
-            shown[0],
+            shown_counts(&counts(294, 6, 50_900, 1))[0],
             "at most 5.1 % of this robot's lifts drop (95 % confidence if objects come in random order; 6 of 300 did)"
         );
-        assert_eq!(shown.len(), 3);
+        assert_eq!(
+            shown_counts(&counts(294, 6, 80_000, 5))[0],
+            "at most 8.0 % of this robot's lifts drop (95 % confidence if no object is lifted more than 5 times in a row; 6 of 300 did)"
+        );
     }
 }

@@ -281,7 +281,7 @@ fn outcomes_of_lifts_withdraw_a_promise_that_they_refute() {
     tell(0..n_before);
     wait_until(|| graph.n_decisions() == n_before, || graph.said());
     let counts = json!({"lifts/kept": 0, "lifts/dropped": 4, "lifts/unreported": 0, "promise_withdrawn": 1,
-        "promise/kept": 0, "promise/dropped": 4});
+        "promise/kept": 0, "promise/dropped": 4, "promise/drops_at_most_ppm": 1_000_000, "promise/lifts_per_object": 5});
     wait_until(|| graph.node("lift_arbiter")["counts"] == counts, || graph.node("lift_arbiter").to_string());
     assert!(
         graph.said().contains("more lifts drop the object than the promised 5 %: 4 of 4 that were reported"),

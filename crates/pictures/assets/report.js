@@ -92,6 +92,7 @@ const evaluation = (report) => {
     n_held > 0 ? "All: with the grasps held without a judgement. " : "",
     `Positive is stable. Deciding always the same would be right for ${first?.judged.majority == null ? "none" : percent(first.judged.majority)}. Intervals are ${made.intervals}.`));
   if (report.looks?.length) section("By stage", stages(report.looks));
+  if (report.baselines) section("Beside plain rules", plainRules(report.baselines));
   if (report.comparisons.length) section("Compared with each other", comparisons(report));
   pairs([roc(judges), precisionRecall(judges), reliability(judges), thresholds(judges)]);
   const highest = roundUp(Math.max(0, ...judges.flatMap(({ by_class }) => by_class.map(({ error_share }) => error_share))));
@@ -137,6 +138,11 @@ const measures = ({ judges, data: { n_held_unjudged } }) => {
   return table(["judged grasps", "accuracy", "precision", "recall", "F1", "false positives\nof all", "false positives\nof unstable", "ROC area",
     "average\nprecision", "Brier\nscore", "calibration\nerror"], rows, { isOwn: (idx) => idx < judges.length });
 };
+const plainRules = ({ look, n_grasps, false_positive_rate, rules }) => [
+  table(["rule", "ROC area", "recall"], rules.map(({ name, roc_area, recall }) => [name, decimals(roc_area), percent(recall)])),
+  caption(`${count(n_grasps)} grasps, ${look.replaceAll("_", "-")}. Of the unstable ones the model lifts ${percent(false_positive_rate)}, and no rule ` +
+    "more. A rule’s threshold is the best one on these grasps."),
+];
 const stages = (looks) => [
   table(["stage", "grasps", "stable", "ROC area", "calibration\nerror", "lifted by\nthe thresholds", "stable ones\nof these"],
     looks.map(({ look, n_grasps, n_stable, roc_area, ece, n_lifted, n_kept }) => [look.replaceAll("_", "-"), count(n_grasps), part(n_stable, n_grasps),

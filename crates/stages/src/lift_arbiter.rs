@@ -31,7 +31,8 @@ use blindgrasp_messages::{Action, Fault, Header, LiftDecision, Phase, Prediction
 pub struct ArbiterOptions {
     /// How many consecutive settled predictions must agree; at least 1.
     pub votes: u32,
-    /// The least probability with which a prediction counts as stable, in addition to the model's own threshold.
+    /// The least probability with which a prediction counts as stable, in place of the model's own threshold, which may be higher;
+    /// 0 keeps the model's.
     pub min_probability_stable: f64,
     /// Greatest time between two predictions of a grasp by the source's clock. A later one counts as stale, unless the source
     /// is as slow as that (`SourcePace`).
@@ -42,6 +43,8 @@ pub struct ArbiterOptions {
     pub probe: Probe,
     /// The promised share of the lifts that drop the object; 1 promises nothing.
     pub promised_drops: f64,
+    /// How many times in a row the robot lifts an object at most: for the bound that its outcomes allow.
+    pub lifts_per_object: u32,
     /// Number of decided grasps that are remembered, so that a late sample does not decide one of them again.
     pub n_remembered: usize,
 }
@@ -84,6 +87,8 @@ impl Default for ArbiterOptions {
             probe: Probe::None,
             // A promise is a model's for objects like its own, which an arbiter does not know.
             promised_drops: 1.0,
+            // People who test lift an object several times in a row. For others the bound falls five times as slowly.
+            lifts_per_object: 5,
             // Far more grasps than can be on their way at once, in 8 kB.
             n_remembered: 1024,
         }
@@ -244,8 +249,13 @@ impl OpenGrasp {
         }
         // With a probe, the frames before it, and those of a tight hand before a test lift, cannot decide for LIFT.
         let is_before_probe = self.is_before_test_lift || self.asks_for(options).is_some();
-        let is_promising = is_before_probe && (prediction.stable || prediction.unsure);
-        let vote = if is_promising { Vote::Promising } else { Vote::of(prediction, options) };
+        let vote = if !is_before_probe {
+            Vote::of(prediction, options)
+        } else if prediction.stable || prediction.unsure {
+            Vote::Promising
+        } else {
+            Vote::Unstable
+        };
         if !is_new_reading {
             // It has no vote, but if it contradicts the votes, they don't count either.
             if self.agreeing.is_some_and(|(said, ..)| said != vote) || self.made_by != header.made_by {
@@ -334,16 +344,26 @@ enum Vote {
 
 impl Vote {
     fn of(prediction: &Prediction, options: &ArbiterOptions) -> Self {
-        match (prediction.stable, prediction.unsure) {
-            (true, false) if prediction.probability_stable >= options.min_probability_stable => Vote::Stable,
-            (false, false) => Vote::Unstable,
+        let is_probable = prediction.probability_stable >= options.min_probability_stable;
+        if is_probable && (prediction.stable || options.min_probability_stable > 0.0) {
+            Vote::Stable
+        } else if prediction.stable || prediction.unsure {
             // This includes a prediction that is stable to the model, but too improbable for the arbiter.
-            _ => Vote::Unsure,
+            Vote::Unsure
+        } else {
+            Vote::Unstable
         }
     }
 }
 
 impl ArbiterOptions {
+    /// Whether a prediction that may decide counts as stable only because `min_probability_stable` is below the model's own
+    /// threshold: then the model's bound on drops does not hold.
+    pub fn loosens(&self, prediction: &Prediction) -> bool {
+        let deciding = self.probe.asked().map_or(Phase::Settled, |(_, phase)| phase);
+        prediction.phase == deciding && !prediction.stable && Vote::of(prediction, self) == Vote::Stable
+    }
+
     /// Whether a prediction is too old. Nothing is as old as [`u64::MAX`]: the age of a prediction from the future.
     fn staleness_of(&self, header: &Header, age_nanos: u64) -> Option<Staleness> {
         let found_nanos = age_nanos;
@@ -387,6 +407,9 @@ impl LiftArbiter {
         self.options = options;
         if self.state.options.promised_drops != options.promised_drops {
             self.state.promise = PromiseMonitor::default();
+        }
+        if self.state.options.lifts_per_object != options.lifts_per_object {
+            self.state.promise.begin_anew();
         }
         if self.state.options != options {
             if let Some(open) = self.state.open.as_mut() {
@@ -561,7 +584,8 @@ impl LiftArbiter {
         if prediction.fault == Fault::Changed {
             self.state.promise.begin_anew();
         }
-        self.state.promise.observe(prediction.phase == Phase::Dropped, self.options.promised_drops);
+        let ArbiterOptions { promised_drops, lifts_per_object, .. } = self.options;
+        self.state.promise.observe(prediction.phase == Phase::Dropped, promised_drops, lifts_per_object);
     }
 
     /// The grasp of that number, opened if it is new, after the one before it has been ended; `None` if it is decided.
@@ -998,6 +1022,27 @@ mod tests {
             let decided: Vec<Reason> = (0..3).flat_map(|_| s.push(vote.clone(), 0)).map(|it| it.reason).collect();
             assert_eq!(decided, [expected], "{probability_stable}");
         }
+    }
+
+    #[test]
+    fn a_threshold_below_the_models_lifts_what_the_model_would_hold() {
+        // The model calls 0.1 unstable and 0.4 unsure.
+        for (min_probability_stable, histories) in [
+            (0.0, ["---[0 Hold Unstable]", "???[0 Hold Unsure]"]),
+            (0.2, ["---[0 Hold Unstable]", "???[0 Lift Stable]"]),
+            (0.05, ["---[0 Lift Stable]", "???[0 Lift Stable]"]),
+        ] {
+            let options = ArbiterOptions { min_probability_stable, ..ArbiterOptions::default() };
+            histories.into_iter().for_each(|history| stream(options).takes(history));
+            let loosens = ['-', '?', '+', 'l'].map(|letter| options.loosens(&prediction(letter)));
+            let is_below = |probability| min_probability_stable > 0.0 && min_probability_stable <= probability;
+            assert_eq!(loosens, [is_below(0.1), is_below(0.4), false, false]);
+        }
+        // It is for the frames that decide: an unstable grasp gets no probe, and no lift without one.
+        let options =
+            ArbiterOptions { min_probability_stable: 0.05, probe: Probe::TestLift, ..ArbiterOptions::default() };
+        stream(options).takes("---[0 Hold Unstable]");
+        assert!(!options.loosens(&prediction('-')));
     }
 
     #[test]

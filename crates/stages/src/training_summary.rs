@@ -74,6 +74,9 @@ pub struct OwnLiftsSummary {
     /// Lifts with an outcome that the model can judge at this look.
     pub n_lifts: usize,
     pub n_kept: usize,
+    /// Other outcomes, by the reason why they taught nothing.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub taught_nothing: BTreeMap<String, usize>,
     /// Different objects among them. A lift whose object is not named counts as one of another object.
     pub n_objects: usize,
     /// The correction of the look's log-odds. It is none if it made the log loss no smaller.
@@ -95,7 +98,10 @@ pub struct OwnLiftsSummary {
 impl TrainingSummary {
     /// Removes the promises, because the model has other probabilities from now on.
     pub fn withdraw_promises(&mut self) {
-        self.policies.iter_mut().for_each(|policy| policy.promise = None);
+        for policy in &mut self.policies {
+            policy.promise = None;
+            policy.curve.clear();
+        }
     }
 }
 
@@ -156,6 +162,33 @@ pub struct PolicySummary {
     /// model's.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub promise: Option<Promise>,
+    /// What other thresholds of this look would lead to, from the lowest on. Models of earlier versions have none.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub curve: Vec<ThresholdPoint>,
+}
+
+/// A threshold of a look, and what to expect if the thresholds of the looks before stay.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ThresholdPoint {
+    pub threshold_probability: f64,
+    /// Of the objects that are lifted, the share that is kept.
+    pub kept: f64,
+    /// Of the stable grasps, the share that is lifted.
+    pub recall: f64,
+    pub attempts_per_lift: f64,
+    /// Share of the trials without a lift.
+    pub given_up: f64,
+    /// The bound of the share of lifts that drop, of this threshold by itself; `None` if nothing is promised.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub drops_at_most: Option<f64>,
+}
+
+impl ThresholdPoint {
+    /// Attempts for each kept object, if a drop costs as much as `drop_costs` attempts.
+    pub fn attempts_per_kept(&self, drop_costs: f64) -> f64 {
+        (self.attempts_per_lift + drop_costs * (1.0 - self.kept)) / self.kept
+    }
 }
 
 /// Upper bounds of drops, for new objects like those that were tried.

@@ -218,7 +218,8 @@ fn may_lift(history: &[Input], decided: &[(usize, u64)], options: &ArbiterOption
     }
     let all_agree = row.iter().all(|input| {
         let Prediction { stable, unsure, probability_stable, .. } = input.prediction;
-        let is_stable = stable && !unsure && probability_stable >= options.min_probability_stable;
+        let is_probable = probability_stable >= options.min_probability_stable;
+        let is_stable = is_probable && (options.min_probability_stable > 0.0 || stable && !unsure);
         input.decides(options) && is_stable && input.header.made_by == last.header.made_by
     });
     !is_heard_before

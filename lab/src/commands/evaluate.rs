@@ -10,6 +10,7 @@ use super::{
     Outcome, check_output, check_page, number_in, percent, print_line, print_text, word, write_out, write_report,
 };
 use blindgrasp_grasps::dataset::{hand_of, label_line, labels_of};
+use blindgrasp_learning::evaluation::baselines::Baselines;
 use blindgrasp_learning::evaluation::cross_validation::{HeldOutOptions, judge_held_out};
 use blindgrasp_learning::evaluation::looks::{Look, looks};
 use blindgrasp_learning::evaluation::page::{FIGURE_1_FILE, figure_1, report_page};
@@ -31,6 +32,8 @@ use blindgrasp_stages::recipe::Recipe;
 
 /// The file among the figures with the probability of each grasp.
 const PREDICTIONS_FILE: &str = "predictions.csv";
+/// The folds of objects of the baseline that is learned from the judged grasps.
+const N_BASELINE_FOLDS: usize = 5;
 
 /// Compare decisions with labels, on recordings or by folds
 ///
@@ -175,25 +178,36 @@ impl Job<'_> {
             print_scores(&evaluated)?;
             print_label(self.recordings)?;
         }
-        let has_probes = model.squeezed.is_some() || model.test_lifted.is_some();
-        let is_asked_for_more =
-            self.arguments.report.is_some() || self.arguments.figures.is_some() || self.arguments.predictions.is_some();
-        if is_table && !is_asked_for_more && !has_probes {
-            return Ok(Outcome::Done);
-        }
         let mut read = Examples::read(self.hand, self.recordings, |_, _| {})?;
         if let Some(trained_on) = &model.training.trained_on {
             read.examples.retain(|example| !trained_on.grasps.contains(&example.reading_id));
         }
+        let baselines = Baselines::new(model, &read.examples, &self.joints_alone(model, &read.examples));
         if is_table {
             print_looks(&looks(model, &read.examples))?;
+            print_baselines(baselines.as_ref())?;
         }
         let outside = self.outside(&read, &[file_name(path)])?;
-        let report = report_on_model(self.origin.clone(), &file_name(path), model, evaluated, &read, outside.as_ref());
+        let name = file_name(path);
+        let report = report_on_model(self.origin.clone(), &name, model, evaluated, &read, baselines, outside.as_ref());
         if is_table && outside.is_some() {
             print_judges(&report)?;
         }
         self.deliver(&report)
+    }
+
+    /// The probabilities of lifts by a model of the joint angles alone, each by one that has not learned from its object. Empty
+    /// for a model without probes, and if the grasps are too few to learn from.
+    fn joints_alone(&self, model: &Model, examples: &[Example]) -> Vec<f64> {
+        if model.squeezed.is_none() && model.test_lifted.is_none() {
+            return Vec::new();
+        }
+        let recipes: Vec<Recipe> = Recipe::named("joints").into_iter().collect();
+        let options =
+            HeldOutOptions { split: Split::Object, n_folds: N_BASELINE_FOLDS, recipes, seed: model.training.seed };
+        let examples: Vec<&Example> = examples.iter().collect();
+        let Ok(held_out) = judge_held_out(self.hand, &examples, &options, |_| {}) else { return Vec::new() };
+        held_out.probabilities.into_iter().next().unwrap_or_default()
     }
 
     fn predictions(self) -> anyhow::Result<Outcome> {
@@ -363,6 +377,19 @@ fn print_looks(looks: &[Look]) -> anyhow::Result<()> {
     }
     print_line("stages: of the grasps that some cell feels, each by one frame")?;
     Ok(())
+}
+
+/// Prints plain rules beside the model.
+fn print_baselines(baselines: Option<&Baselines>) -> anyhow::Result<()> {
+    let Some(baselines) = baselines else { return Ok(()) };
+    let head = format!("rule, {} grasps", baselines.look.replace('_', "-"));
+    let limit = percent(Some(baselines.false_positive_rate));
+    print_line(&format!("{head:<60} ROC area  recall at {limit} of the unstable"))?;
+    for rule in &baselines.rules {
+        let area = rule.roc_area.map_or("n/a".into(), |area| format!("{area:.3}"));
+        print_line(&format!("{:<60} {area:>8}  {:>6}", rule.name, percent(Some(rule.recall))))?;
+    }
+    Ok(print_line(&baselines.in_words())?)
 }
 
 fn share(estimate: Option<Estimate>) -> String {

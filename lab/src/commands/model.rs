@@ -7,7 +7,7 @@ use clap::{Args, Subcommand};
 use serde_json::json;
 
 use super::train::{probe_lines, threshold_line};
-use super::{Outcome, check_new, completions, percent, print_line, print_text};
+use super::{Outcome, check_new, completions, number_in, percent, print_line, print_text};
 use blindgrasp_grasps::dataset::{hand_of, label_line};
 use blindgrasp_learning::training::adapt;
 use blindgrasp_operator::text::counted;
@@ -19,7 +19,7 @@ use blindgrasp_stages::day::{Baseline, DayMethod};
 use blindgrasp_stages::model::Model;
 use blindgrasp_stages::own_lifts::Correction;
 use blindgrasp_stages::probe::ProbeModel;
-use blindgrasp_stages::training_summary::OwnLiftsSummary;
+use blindgrasp_stages::training_summary::{OwnLiftsSummary, PolicySummary, ThresholdPoint};
 
 /// Describe or adapt a model, or rate approaches
 #[derive(Debug, Args)]
@@ -65,10 +65,15 @@ struct AdaptArguments {
 
 /// Print what a model is made of: all but its support vectors and the identities of its training grasps.
 #[derive(Debug, Args)]
-#[command(after_help = "Example: blindgrasp model show models/barrett-bh8-280.json --json")]
+#[command(after_help = "Examples:\n  \
+                        blindgrasp model show models/barrett-bh8-280.json --json\n  \
+                        blindgrasp model show gate.json --drop-costs 60      which threshold, if a drop costs as much as 60 attempts")]
 struct ShowArguments {
     /// The model.
     model: PathBuf,
+    /// Mark the threshold with the least attempts for each kept object, if a drop costs as much as so many attempts.
+    #[arg(long, value_name = "ATTEMPTS", value_parser = |text: &str| number_in(text, 0.0..=1e6))]
+    drop_costs: Option<f64>,
     /// Print JSON.
     #[arg(long)]
     json: bool,
@@ -132,6 +137,11 @@ fn own_lifts_lines(model: &Model) -> Vec<String> {
         counted(n_lifts, "lift"),
         counted(n_objects, "object")
     )];
+    if !own.taught_nothing.is_empty() {
+        let n: usize = own.taught_nothing.values().sum();
+        let reasons: Vec<String> = own.taught_nothing.iter().map(|(reason, n)| format!("{n} {reason}")).collect();
+        lines.push(format!("{n} other grasps taught nothing: {}", reasons.join(", ")));
+    }
     if own.n_outside > 0 {
         lines.push(format!("limits are wider, because they held {} of these grasps", own.n_outside));
     }
@@ -148,19 +158,81 @@ fn show(arguments: &ShowArguments) -> anyhow::Result<Outcome> {
         print_text(&serde_json::to_string_pretty(&model_json(&model)?)?)?;
         return Ok(Outcome::Done);
     }
-    print_model(&model)?;
+    print_model(&model, arguments.drop_costs)?;
     Ok(Outcome::Done)
 }
 
 /// Prints what a model is made of, for people.
-pub(super) fn print_model(model: &Model) -> std::io::Result<()> {
+pub(super) fn print_model(model: &Model, drop_costs: Option<f64>) -> std::io::Result<()> {
     for (name, value) in described(model) {
         print_line(&format!("{name:<16} {value}"))?;
     }
     for line in probe_lines(model) {
         print_line(&line)?;
     }
+    if let Some(policy) = model.training.policies.last() {
+        for line in curve_lines(policy, own_threshold(model, policy), drop_costs) {
+            print_line(&line)?;
+        }
+    }
     Ok(())
+}
+
+fn own_threshold(model: &Model, policy: &PolicySummary) -> f64 {
+    let probe = match policy.look.as_str() {
+        "squeezed" => &model.squeezed,
+        "test_lifted" => &model.test_lifted,
+        _ => &None,
+    };
+    probe.as_ref().map_or(&model.classifier, |probe| &probe.classifier).threshold_probability
+}
+
+/// The thresholds of the look that decides, for people, with the model's own and the cheapest for this price of a drop.
+fn curve_lines(policy: &PolicySummary, own: f64, drop_costs: Option<f64>) -> Vec<String> {
+    let look = policy.look.replace('_', "-");
+    if policy.curve.is_empty() {
+        return vec![format!(
+            "no curve of thresholds when {look}: the model was adapted, or an earlier version trained it (blindgrasp train)"
+        )];
+    }
+    let mut cheapest = None;
+    if let Some(drop_costs) = drop_costs {
+        let cost = |point: &&ThresholdPoint| point.attempts_per_kept(drop_costs);
+        cheapest = policy.curve.iter().min_by(|a, b| cost(a).total_cmp(&cost(b)));
+    }
+    let mut lines = vec![format!(
+        "{:<27} {:>8} {:>9} {:>16} {:>9} {:>20}",
+        format!("threshold when {look}"),
+        "kept",
+        "recall",
+        "attempts a lift",
+        "given up",
+        "drops at most (95 %)"
+    )];
+    for point in &policy.curve {
+        let mut line = format!(
+            "{:<27} {:>8} {:>9} {:>16.2} {:>9} {:>20}",
+            format!("{:.4}", point.threshold_probability),
+            percent(Some(point.kept)),
+            percent(Some(point.recall)),
+            point.attempts_per_lift,
+            percent(Some(point.given_up)),
+            percent(point.drops_at_most)
+        );
+        if point.threshold_probability == own {
+            line += "  the model's own";
+        }
+        if Some(point) == cheapest {
+            line += "  the cheapest for this price of a drop";
+        }
+        lines.push(line);
+    }
+    if let Some(point) = cheapest {
+        // It is rounded down, so that it does not pass the grasps at the threshold; 0 would be the model's own.
+        let threshold = ((1e4 * point.threshold_probability).floor() / 1e4).max(1e-4);
+        lines.push(format!("to choose it: blindgrasp set lift_arbiter.min_probability_stable={threshold}"));
+    }
+    lines
 }
 
 fn model_json(model: &Model) -> anyhow::Result<serde_json::Value> {
@@ -299,4 +371,43 @@ fn trees_json(trees: &BoostedTrees) -> serde_json::Value {
         "n_trees": trees.trees.len(),
         "n_nodes": trees.n_nodes(),
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_price_of_a_drop_chooses_a_point_of_the_curve() {
+        let point = |threshold_probability, kept, attempts_per_lift| ThresholdPoint {
+            threshold_probability,
+            kept,
+            recall: 0.5,
+            attempts_per_lift,
+            given_up: 0.1,
+            drops_at_most: Some(0.08),
+        };
+        let mut policy = PolicySummary {
+            look: "test_lifted".into(),
+            drop_secs: 300.0,
+            roc_area: 0.97,
+            kept: 0.98,
+            attempts_per_lift: 6.0,
+            given_up: 0.1,
+            secs_per_kept: 30.0,
+            promise: None,
+            curve: vec![point(0.51239, 0.9, 2.0), point(0.933, 0.98, 6.0)],
+        };
+        let marked = |policy: &PolicySummary, drop_costs| curve_lines(policy, 0.933, drop_costs);
+        let lines = marked(&policy, None);
+        assert_eq!((lines.len(), lines.iter().filter(|line| line.contains("cheapest")).count()), (3, 0));
+        assert!(lines[2].contains("98.0 %") && lines[2].ends_with("8.0 %  the model's own"), "{lines:?}");
+        // (2 + 10 x 0.1) / 0.9 = 3.3 attempts for each kept object, and (6 + 10 x 0.02) / 0.98 = 6.3.
+        let lines = marked(&policy, Some(10.0));
+        assert!(lines[1].contains("cheapest") && lines[3].ends_with("min_probability_stable=0.5123"), "{lines:?}");
+        // 13.3 and 8.2.
+        assert!(marked(&policy, Some(100.0))[2].ends_with("the model's own  the cheapest for this price of a drop"));
+        policy.curve.clear();
+        assert!(marked(&policy, Some(10.0))[0].starts_with("no curve of thresholds when test-lifted"));
+    }
 }

@@ -100,7 +100,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     if !model.training.converged {
         print_diagnostic(&format!("blindgrasp: the SVM did not reach its tolerance in {n_iterations} iterations"));
     }
-    print_model(&model)?;
+    print_model(&model, None)?;
     Ok(Outcome::Done)
 }
 

@@ -263,9 +263,13 @@ impl Source for SimulatedHand<'_> {
                 self.save()?;
                 Ok(Step::Next)
             }
-            Doing::LeavesOut { trial, why } => {
-                tracing::warn!(trial, "left out: {why}");
-                self.count("left_out");
+            Doing::LeavesOut { trial, n_attempts, why } => {
+                if n_attempts == 0 {
+                    tracing::warn!(trial, "left out: {why}");
+                    self.count("left_out");
+                } else {
+                    tracing::warn!(trial, n_attempts, "given up: {why}");
+                }
                 self.save()?;
                 Ok(Step::Next)
             }

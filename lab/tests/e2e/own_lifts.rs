@@ -137,9 +137,11 @@ fn the_outcomes_of_a_bridge_are_labels_and_correct_a_model() {
     let mut read = Examples::read(&layout, &[own.clone().into()], |_, _| {}).expect("examples");
     let known = Model::load(Path::new(&model)).expect("a model");
     read.labels.insert(Label::Lift, 1);
+    read.n_excluded.insert("no_contact".into(), 3);
     adapt_on(&layout, &known, &read, &[]).expect("adapted").save(Path::new(&adapted)).expect("saved");
     let shown = text(&run(&["model", "show", &adapted], 0).stdout).to_owned();
     assert!(shown.contains("objects in simulation") && !shown.contains("on this robot"), "{shown}");
+    assert!(shown.contains("3 other grasps taught nothing: 3 no_contact"), "{shown}");
     read.labels.insert(Label::WrenchSpace, 1);
     let error = adapt_on(&layout, &known, &read, &[]).expect_err("refused").to_string();
     assert!(error.contains("have the paper's label"), "{error}");

@@ -318,9 +318,7 @@ fn print_report(arguments: &Arguments, report: &TrialsReport) -> anyhow::Result<
             report.end
         ))?;
     }
-    if let Some(left_out) = report.left_out() {
-        print_text(&format!("\n{left_out}."))?;
-    }
+    print_text(&format!("\n{}", report.in_four_numbers().join("\n")))?;
     if let Some(path) = &arguments.report {
         print_text(&format!("\nreport: {}", path.display()))?;
     }

@@ -25,13 +25,25 @@ pub struct Look {
     pub n_kept: usize,
 }
 
-/// One entry for each look that some grasp has, in order; empty for a model without probes. Whether a grasp is unlike the training
-/// data is not considered, nor are votes: the graph lifts fewer.
-pub fn looks(model: &Model, examples: &[Example]) -> Vec<Look> {
-    if model.squeezed.is_none() && model.test_lifted.is_none() {
-        return Vec::new();
+/// A look at all grasps.
+pub(super) struct JudgedLook {
+    pub(super) phase: Phase,
+    threshold: f64,
+    /// The probability of each grasp; `None` if it has no such look.
+    pub(super) probabilities: Vec<Option<f64>>,
+    /// Whether each grasp was promising at all looks before.
+    is_promising: Vec<bool>,
+}
+
+impl JudgedLook {
+    /// Whether the model's thresholds lift a grasp.
+    pub(super) fn lifts(&self, idx: usize) -> bool {
+        self.is_promising[idx] && self.probabilities[idx] >= Some(self.threshold)
     }
-    // Whether a grasp was promising at all looks before.
+}
+
+/// The looks that the model has, in order.
+pub(super) fn judged_looks(model: &Model, examples: &[Example]) -> Vec<JudgedLook> {
     let mut is_promising = vec![true; examples.len()];
     let mut looks = Vec::new();
     for phase in LOOKS {
@@ -41,32 +53,39 @@ pub fn looks(model: &Model, examples: &[Example]) -> Vec<Look> {
             let decision_value = classifier.predictor.decision_value(&values_at(model, phase, example)?).ok()?;
             Some(classifier.calibration.probability(decision_value))
         };
-        let judged: Vec<Option<f64>> = examples.iter().map(judge).collect();
-        let look = Look::of(phase, classifier.threshold_probability, examples, &judged, &is_promising);
-        if look.n_grasps > 0 {
-            looks.push(look);
-        }
-        for (is_promising, probability) in is_promising.iter_mut().zip(&judged) {
+        let probabilities: Vec<Option<f64>> = examples.iter().map(judge).collect();
+        let threshold = classifier.threshold_probability;
+        let judged = JudgedLook { phase, threshold, probabilities, is_promising: is_promising.clone() };
+        for (is_promising, probability) in is_promising.iter_mut().zip(&judged.probabilities) {
             *is_promising &= *probability >= Some(classifier.unsure_from_probability);
         }
+        looks.push(judged);
     }
     looks
 }
 
+/// One entry for each look that some grasp has, in order; empty for a model without probes. Whether a grasp is unlike the training
+/// data is not considered, nor are votes: the graph lifts fewer.
+pub fn looks(model: &Model, examples: &[Example]) -> Vec<Look> {
+    if model.squeezed.is_none() && model.test_lifted.is_none() {
+        return Vec::new();
+    }
+    let looks = judged_looks(model, examples);
+    looks.iter().map(|judged| Look::of(judged, examples)).filter(|look| look.n_grasps > 0).collect()
+}
+
 impl Look {
-    /// `judged` has a grasp's probability; `None` if it has no such look.
-    fn of(phase: Phase, threshold: f64, examples: &[Example], judged: &[Option<f64>], is_promising: &[bool]) -> Look {
+    fn of(judged: &JudgedLook, examples: &[Example]) -> Look {
         let (mut probabilities, mut stable, mut n_lifted, mut n_kept) = (Vec::new(), Vec::new(), 0, 0);
         for (idx, example) in examples.iter().enumerate() {
-            let Some(probability) = judged[idx] else { continue };
+            let Some(probability) = judged.probabilities[idx] else { continue };
             probabilities.push(probability);
             stable.push(example.stable);
-            let is_lifted = is_promising[idx] && probability >= threshold;
-            n_lifted += usize::from(is_lifted);
-            n_kept += usize::from(is_lifted && example.stable);
+            n_lifted += usize::from(judged.lifts(idx));
+            n_kept += usize::from(judged.lifts(idx) && example.stable);
         }
         Look {
-            look: phase.as_str().into(),
+            look: judged.phase.as_str().into(),
             n_grasps: stable.len(),
             n_stable: stable.iter().filter(|stable| **stable).count(),
             roc_area: area_under_roc(&curve(&probabilities, &stable)),

@@ -5,8 +5,9 @@
 //! * [`measures`], [`statistics`], [`decisions`] and [`comparison`] compute figures; [`report`] collects them, [`mod@page`]
 //!   shows them.
 //! * [`predictions`] reads what a model that is not blindgrasp's says of the same grasps, to judge it as the others.
-//! * [`looks`] judges the probes of models of lifts.
+//! * [`looks`] judges the probes of models of lifts, [`baselines`] has plain rules beside them.
 
+pub mod baselines;
 pub mod comparison;
 pub mod cross_validation;
 pub mod decisions;

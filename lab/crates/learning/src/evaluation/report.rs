@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use serde::Serialize;
 
+use super::baselines::Baselines;
 use super::comparison::{Comparison, compare};
 use super::cross_validation::{HeldOut, HeldOutOptions, N_INNER_FOLDS, used_words};
 use super::decisions::{JudgedGrasp, JudgedRecipe, Unit};
@@ -33,6 +34,9 @@ pub struct Report {
     /// The looks of a model with probes; empty otherwise.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub looks: Vec<Look>,
+    /// Plain rules beside a model.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub baselines: Option<Baselines>,
     pub data: Data,
     /// The paper's Table I, and the same rows for these data.
     pub table_1: Vec<TableRow>,
@@ -161,6 +165,7 @@ pub fn report_on_recipes(
         graph: None,
         trained: None,
         looks: Vec::new(),
+        baselines: None,
         data: data(any, read.n_excluded.clone()),
         table_1: table_1(Some(training), &judges),
         comparisons: comparisons(&judges, unit, options.seed),
@@ -176,6 +181,7 @@ pub fn report_on_recipes(
 /// Makes the report on a model, whose decisions are those of the graph, and on predictions of outside models if there are any.
 ///
 /// * `name` - the model's file.
+/// * `baselines` - plain rules beside it.
 /// * `read` - the same recordings as examples without those that the model was trained on, for its looks and the dictionary's
 ///   picture.
 pub fn report_on_model(
@@ -184,6 +190,7 @@ pub fn report_on_model(
     model: &Model,
     evaluated: Evaluated,
     read: &Examples,
+    baselines: Option<Baselines>,
     outside: Option<&OutsidePredictions>,
 ) -> Report {
     let Evaluated { evaluation: graph, decided, trained } = evaluated;
@@ -211,6 +218,7 @@ pub fn report_on_model(
         graph: Some(graph),
         trained,
         looks: looks(model, &read.examples),
+        baselines,
     }
 }
 
@@ -223,6 +231,7 @@ pub fn report_on_predictions(origin: Origin, read: &Examples, outside: &OutsideP
         graph: None,
         trained: None,
         looks: Vec::new(),
+        baselines: None,
         data: data(judges.first().map_or(&[][..], |judge| judge.decided.as_slice()), read.n_excluded.clone()),
         table_1: table_1(None, &judges),
         comparisons: comparisons(&judges, unit, INTERVAL_SEED),

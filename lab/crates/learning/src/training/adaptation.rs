@@ -94,14 +94,16 @@ fn adapt_to_lifts(hand: &Hand, model: &Model, read: &Examples, recordings: &[Pat
     let Some((look, classifier)) = deciding_look(model, &read.examples) else {
         return refused("no grasp with an outcome has frames that the model decides by: record whole grasps".into());
     };
-    let lifts = judged_lifts(look, model, &read.examples);
+    let (lifts, mut taught_nothing) = judged_lifts(look, model, &read.examples);
+    for (reason, n) in &read.n_excluded {
+        *taught_nothing.entry(reason.clone()).or_default() += n;
+    }
     if lifts.len() < FEWEST_OUTCOMES {
         return refused(format!(
             "{} lifts with an outcome that the model can judge when the hand is {}: expected {FEWEST_OUTCOMES} or more (left \
-             out: {:?})",
+             out: {taught_nothing:?})",
             lifts.len(),
             look.as_str(),
-            read.n_excluded
         ));
     }
     let examples: Vec<&Example> = lifts.iter().map(|lift| lift.example).collect();
@@ -133,6 +135,7 @@ fn adapt_to_lifts(hand: &Hand, model: &Model, read: &Examples, recordings: &[Pat
         look: look.as_str().into(),
         n_lifts: lifts.len(),
         n_kept: examples.iter().filter(|example| example.stable).count(),
+        taught_nothing,
         n_objects,
         correction: own.learned.correction,
         log_loss_before: own.log_losses[0],
@@ -158,18 +161,25 @@ fn deciding_look<'a>(model: &'a Model, examples: &[Example]) -> Option<(Phase, &
     None
 }
 
-/// The grasps that the model judges at a look. A robot that obeys gives up those that an earlier look calls unstable.
-fn judged_lifts<'a>(look: Phase, model: &Model, examples: &'a [Example]) -> Vec<JudgedLift<'a>> {
-    let mut lifts = Vec::new();
+/// The grasps that the model judges at a look, and the number of the others by reason. A robot that obeys gives up those that an
+/// earlier look calls unstable.
+fn judged_lifts<'a>(
+    look: Phase,
+    model: &Model,
+    examples: &'a [Example],
+) -> (Vec<JudgedLift<'a>>, BTreeMap<String, usize>) {
+    let (mut lifts, mut others) = (Vec::new(), BTreeMap::new());
     for example in examples {
         let mut earlier = LOOKS.into_iter().take_while(|other| *other != look);
-        if !earlier.any(|earlier| is_unstable(model, earlier, example))
-            && let Some(log_odds) = log_odds(model, look, example)
-        {
+        if let Some(earlier) = earlier.find(|earlier| is_unstable(model, *earlier, example)) {
+            *others.entry(format!("held when {}", earlier.as_str())).or_default() += 1;
+        } else if let Some(log_odds) = log_odds(model, look, example) {
             lifts.push(JudgedLift { example, log_odds });
+        } else {
+            *others.entry(format!("no contact when {}, or no such frame", look.as_str())).or_default() += 1;
         }
     }
-    lifts
+    (lifts, others)
 }
 
 /// The lifts that a look decides, with all that learning from them needs.

@@ -23,13 +23,15 @@ use blindgrasp_stages::model::Model;
 use blindgrasp_stages::own_lifts::{ATTEMPT_SECS, LIFT_SECS, SQUEEZE_SECS, TEST_LIFT_SECS};
 use blindgrasp_stages::probe::{GraspHistory, ProbeModel, n_values, signals};
 use blindgrasp_stages::recipe::Recipe;
-use blindgrasp_stages::training_summary::Promise;
+use blindgrasp_stages::training_summary::{Promise, ThresholdPoint};
 
 /// The attempts of a trial that is never lifted.
 const MOST_ATTEMPTS: u32 = 20;
 /// Costs that differ by a smaller part than this count as equal. The cost is flat near its least value: two simulations of the same
 /// 10,000 lifts, with other noise of the cells, had their least costs where 3.1 and 5.1 % of the lifts drop.
 const EQUAL_COST: f64 = 0.02;
+/// The thresholds of a curve, beside the chosen one.
+const N_POINTS: usize = 8;
 /// Probes are judged by trees that learn from many more values than a settled grasp has.
 const PARAMS: BoostingParams = BoostingParams {
     n_rounds: 400,
@@ -145,7 +147,7 @@ fn composed_rows(features: &FeatureExtractor, phase: Phase, examples: &[&Example
 }
 
 /// The frame of a look, as it was felt.
-pub(super) fn reading_at(look: Phase, example: &Example) -> Option<FeltReading<'_>> {
+pub(crate) fn reading_at(look: Phase, example: &Example) -> Option<FeltReading<'_>> {
     match look {
         Phase::Settled => Some(example.reading()),
         Phase::Squeezed => example.squeezed.as_ref().map(Felt::reading),
@@ -307,6 +309,35 @@ impl Policies {
             tried.extend(counts.iter().map(|count| count.trials(self.n_attempts)));
         }
         Some(Promise { n_attempts: Some(self.n_attempts), ..promise(&tried)? })
+    }
+
+    /// What other thresholds of the deciding look lead to than the chosen one, which is among them: those that lift evenly spread
+    /// parts of the stable grasps.
+    pub(super) fn curve(&self, chosen: Thresholds, last: Phase) -> Vec<ThresholdPoint> {
+        let grasps: Vec<Attempted> = self.folds.iter().flat_map(|(grasps, _)| grasps.iter().copied()).collect();
+        let mut lifts: Vec<f64> =
+            grasps.iter().filter(|grasp| grasp.stable).filter_map(|grasp| grasp.decided).collect();
+        lifts = quantiles(lifts, N_POINTS);
+        lifts.push(chosen.lift);
+        lifts.sort_by(f64::total_cmp);
+        lifts.dedup();
+        let n_stable = grasps.iter().filter(|grasp| grasp.stable).count() as f64;
+        let mut points = Vec::new();
+        for lift in lifts {
+            let thresholds = Thresholds { lift, ..chosen };
+            let Some(expected) = expect(&grasps, thresholds, last) else { continue };
+            let counts = counts(&grasps, thresholds);
+            let tried: Vec<ObjectTrials> = counts.iter().map(|count| count.trials(self.n_attempts)).collect();
+            points.push(ThresholdPoint {
+                threshold_probability: lift,
+                kept: expected.kept,
+                recall: counts.iter().map(|count| count.kept).sum::<f64>() / n_stable,
+                attempts_per_lift: expected.attempts_per_lift,
+                given_up: expected.given_up,
+                drops_at_most: promise(&tried).map(|promise| promise.drops_of_lifts.at_most),
+            });
+        }
+        points
     }
 }
 
@@ -534,6 +565,27 @@ mod tests {
         let chosen =
             |drop_secs| policies.cheapest(drop_secs).map(|policy| (policy.thresholds.lift, policy.expected.kept));
         assert_eq!((chosen(0.0), chosen(1000.0)), (Some((0.3, 0.75)), Some((0.9, 1.0))));
+    }
+
+    #[test]
+    fn a_curve_has_what_each_threshold_leads_to() {
+        let grasps =
+            grasps(&[("a", 0.9, 0.9, true), ("a", 0.9, 0.3, true), ("a", 0.9, 0.3, true), ("a", 0.9, 0.3, false)]);
+        let policies = Policies::new(&grasps, Phase::Squeezed, [1.0, 1.0]);
+        let chosen = Thresholds { promising: 0.5, promising_squeezed: 0.0, lift: 0.5 };
+        let curve = policies.curve(chosen, Phase::Squeezed);
+        let figures = |point: &ThresholdPoint| (point.threshold_probability, point.kept, point.recall);
+        assert_eq!(
+            curve.iter().map(figures).collect::<Vec<_>>(),
+            [(0.3, 0.75, 1.0), (0.5, 1.0, 1.0 / 3.0), (0.9, 1.0, 1.0 / 3.0)]
+        );
+        // A quarter of the grasps is lifted at 0.9, in random order after 2.5 attempts.
+        assert_eq!((curve[0].attempts_per_lift, curve[2].attempts_per_lift), (1.0, 2.5));
+        // A drop that costs nothing is worth no attempt, one that costs ten is.
+        let costs = |drop_costs: f64| [0, 2].map(|idx: usize| curve[idx].attempts_per_kept(drop_costs));
+        assert!(costs(0.0)[0] < costs(0.0)[1] && costs(10.0)[0] > costs(10.0)[1], "{:?} {:?}", costs(0.0), costs(10.0));
+        // No threshold of the grasps that are given up before lifts anything.
+        assert!(policies.curve(Thresholds { promising: 1.0, ..chosen }, Phase::Squeezed).is_empty());
     }
 
     #[test]

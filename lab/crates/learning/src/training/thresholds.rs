@@ -7,7 +7,7 @@ use super::{OutOfFold, TrainingError, out_of_fold_probabilities};
 use crate::evaluation::measures::{area_under_roc, curve};
 use blindgrasp_messages::Phase;
 use blindgrasp_stages::classifier::Classifier;
-use blindgrasp_stages::training_summary::{Bounded, PolicySummary, Promise};
+use blindgrasp_stages::training_summary::{Bounded, PolicySummary, Promise, ThresholdPoint};
 
 /// The aim of thresholds that are chosen for trials, in which a hand grasps again until it lifts.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -31,6 +31,7 @@ struct Chosen {
     policy: Policy,
     drop_secs: f64,
     promise: Option<Promise>,
+    curve: Vec<ThresholdPoint>,
 }
 
 /// Why a look has no policy, and the least bound on drops that it has; 1 for none.
@@ -63,7 +64,8 @@ impl Aim {
                     );
                     return Err(Refusal { why, at_most: 1.0 });
                 };
-                return Ok(Chosen { look, policy, drop_secs, promise: policies.promise(drop_secs) });
+                let (promise, curve) = (policies.promise(drop_secs), policies.curve(policy.thresholds, look));
+                return Ok(Chosen { look, policy, drop_secs, promise, curve });
             }
         };
         let mut passed = None;
@@ -79,7 +81,8 @@ impl Aim {
             // The sequence of tests bounds drops by this share, and not by the bound that the last test alone gives.
             promise.drops_of_lifts = Bounded { at_most: max_drops, ..promise.drops_of_lifts };
             promise.drops_of_trials = Bounded { at_most: max_drops, ..promise.drops_of_trials };
-            return Ok(Chosen { look, policy, drop_secs, promise: Some(promise) });
+            let curve = policies.curve(policy.thresholds, look);
+            return Ok(Chosen { look, policy, drop_secs, promise: Some(promise), curve });
         }
         let look = look.as_str();
         let Some(promise) = policies.promise(DROP_SECS[0]) else {
@@ -99,7 +102,7 @@ impl Aim {
 }
 
 impl Chosen {
-    fn summary(&self, roc_area: f64) -> PolicySummary {
+    fn summary(self, roc_area: f64) -> PolicySummary {
         PolicySummary {
             roc_area,
             look: self.look.as_str().into(),
@@ -109,6 +112,7 @@ impl Chosen {
             given_up: self.policy.expected.given_up,
             secs_per_kept: self.policy.expected.secs_per_kept,
             promise: self.promise,
+            curve: self.curve,
         }
     }
 }
@@ -150,6 +154,9 @@ pub(super) fn choose_thresholds(
         }
         if is_before_test_lift || !promises {
             chosen.promise = None;
+        }
+        if !promises {
+            chosen.curve.iter_mut().for_each(|point| point.drops_at_most = None);
         }
         let mut roc_area = settled_roc_area;
         if let Some(learned) = probes.after(chosen.look) {

@@ -193,21 +193,10 @@ fn scene(snapshot: &Snapshot) -> PosedScene {
 
 /// The result in one paragraph.
 fn lead(report: &TrialsReport) -> String {
-    let mut parts = Vec::new();
-    for (name, tallies) in
-        [("With the gate", &report.with_gate), ("With every settled grasp lifted", &report.without_gate)]
-    {
-        if let Some(total) = tallies.as_ref().map(|tallies| &tallies.total) {
-            parts.push(format!(
-                "{name}, {} of {} lifts kept ({} attempts, {} of {} trials given up).",
-                total.n_held, total.n_lifts, total.n_attempts, total.n_given_up, total.n_trials
-            ));
-        }
-    }
+    let mut parts = report.in_four_numbers();
     if let Some(effect) = &report.effect {
         parts.push(format!("Of {} drops, {} were avoided.", effect.n_dropped_without, effect.n_avoided));
     }
-    parts.extend(report.left_out().map(|left_out| format!("{left_out}.")));
     parts.extend(report.late.and_then(|late| late.advice()).map(|advice| format!("{advice}.")));
     if report.end != "finished" {
         parts.push(format!("The run was {} before all {} trials were done.", report.end, report.n_trials));
@@ -250,7 +239,7 @@ mod tests {
             .collect();
         let page = trials_page(&hand, &report, &strips).expect("a page");
         for expected in [
-            "2 of 3 lifts kept (8 attempts, 1 of 4 trials given up)",
+            "with the gate: 4 reached the object, 3 lifted it, 2 kept it, in 8 attempts.",
             "Of 2 drops, 2 were avoided.",
             "\"2 of 2, 100 % (34-100)\"",
             "Table IV: the mug by mass",

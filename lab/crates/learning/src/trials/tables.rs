@@ -111,18 +111,30 @@ impl TrialsReport {
     /// Counts; an empty list of records is a way that was not run.
     pub fn count(&mut self) {
         let (with, without) = (&self.records_with_gate, &self.records_without_gate);
-        let tallies = |records: &[TrialRecord]| (!records.is_empty()).then(|| Tallies::new(records, self.max_attempts));
+        let is_finished = self.end == "finished";
+        let tallies = |records: &[TrialRecord]| {
+            (!records.is_empty()).then(|| Tallies::new(records, self.max_attempts, is_finished))
+        };
         (self.with_gate, self.without_gate) = (tallies(with), tallies(without));
         let both = !with.is_empty() && !without.is_empty();
-        self.effect = both.then(|| GateEffect::new(with, without, self.max_attempts));
+        self.effect = both.then(|| GateEffect::new(with, without, self.max_attempts, is_finished));
     }
 
-    /// How many trials were left out and why, in a line; `None` if none was.
-    pub fn left_out(&self) -> Option<String> {
-        (self.n_left_out > 0).then(|| {
-            let (n_left_out, n_trials) = (self.n_left_out, self.n_trials);
-            format!("{n_left_out} of {n_trials} trials were left out: no approach led to the object as it stood")
-        })
+    /// How many trials reached, lifted and kept their object, and in how many attempts: a sentence for each way.
+    pub fn in_four_numbers(&self) -> Vec<String> {
+        let mut lines = Vec::new();
+        for (name, Tallies { n_reached, total, .. }) in self.ways() {
+            let Tally { n_lifts, n_held, n_attempts, .. } = total;
+            let mut line = format!(
+                "Of {} trials, {name}: {n_reached} reached the object, {n_lifts} lifted it, {n_held} kept it, in {n_attempts} attempts.",
+                self.n_trials
+            );
+            if self.n_left_out > 0 {
+                line += &format!(" No approach led to the object in {}: these are left out.", self.n_left_out);
+            }
+            lines.push(line);
+        }
+        lines
     }
 
     /// What there is to show: the ways that were run, with what columns call them.
@@ -486,6 +498,19 @@ pub(super) mod tests {
         assert_eq!(tables.len(), 5, "{tables:?}");
         assert_eq!(tables[0].head, ["object", "mass, kg", "kept, with the gate"]);
         assert_eq!(tables[0].rows[0][2], "1 of 1, 100 % (21-100)");
+    }
+
+    #[test]
+    fn a_trial_with_an_attempt_is_reached_however_it_ends() {
+        let mut report = report(records(&[("box", "box", 0.1, "-h"), ("lemon", "lemon", 0.1, "--")]), Vec::new());
+        (report.n_trials, report.n_left_out) = (5, 3);
+        assert_eq!(
+            report.in_four_numbers(),
+            [
+                "Of 5 trials, with the gate: 2 reached the object, 1 lifted it, 1 kept it, in 4 attempts. No approach led to the object \
+              in 3: these are left out."
+            ]
+        );
     }
 
     #[test]

@@ -134,6 +134,8 @@ pub struct Tallies {
     pub n_set_down: usize,
     /// Objects kept in an hour of the robot's time; putting an object back takes none.
     pub kept_per_hour: Option<f64>,
+    /// Trials with an attempt.
+    pub n_reached: usize,
     /// Trials that had no end: the run was stopped.
     pub n_unfinished: usize,
     /// The bounds of drops for new objects under the same policy; `None` without lifts, and for the paper's things, which are one
@@ -175,9 +177,9 @@ pub(super) struct Trial<'a> {
 }
 
 impl Tallies {
-    /// Counts. A trial without a lift has come to its end if it has `max_attempts` attempts.
-    pub fn new(records: &[TrialRecord], max_attempts: u32) -> Self {
-        let (trials, n_unfinished) = trials(records, max_attempts);
+    /// Counts the trials of a run; `is_finished` says that it was not stopped.
+    pub fn new(records: &[TrialRecord], max_attempts: u32, is_finished: bool) -> Self {
+        let (trials, n_unfinished) = trials(records, max_attempts, is_finished);
         let mut held_by_closure = [[0; 2]; 3];
         for trial in trials.values().filter(|trial| trial.ending != Ending::GivenUp) {
             // A hull that failed says nothing.
@@ -206,6 +208,7 @@ impl Tallies {
             groups: by_name(&trials, |record| &record.group),
             things,
             held_by_closure,
+            n_reached: trials.len() + n_unfinished,
             n_unfinished,
         }
     }
@@ -221,9 +224,10 @@ fn promise_of(things: &[Tally]) -> Option<Promise> {
 }
 
 impl GateEffect {
-    /// Compares trials of the same number. A trial without a lift has come to its end if it has `max_attempts` attempts.
-    pub fn new(with: &[TrialRecord], without: &[TrialRecord], max_attempts: u32) -> Self {
-        let ((with, _), (without, _)) = (trials(with, max_attempts), trials(without, max_attempts));
+    /// Compares trials of the same number; `is_finished` says that no run was stopped.
+    pub fn new(with: &[TrialRecord], without: &[TrialRecord], max_attempts: u32, is_finished: bool) -> Self {
+        let (with, _) = trials(with, max_attempts, is_finished);
+        let (without, _) = trials(without, max_attempts, is_finished);
         let pairs: Vec<(&Trial<'_>, &Trial<'_>)> =
             with.iter().filter_map(|(number, trial)| Some((trial, without.get(number)?))).collect();
         let count = |is_counted: &dyn Fn(Ending, Ending) -> bool| {
@@ -243,13 +247,16 @@ impl GateEffect {
     }
 }
 
-/// Trials that came to an end by their number, and how many did not. A record that comes twice counts once.
-pub(super) fn trials(records: &[TrialRecord], max_attempts: u32) -> (BTreeMap<u64, Trial<'_>>, usize) {
+/// Trials that came to an end by their number, and how many did not. A trial without a lift ends with `max_attempts` attempts, or
+/// with fewer if no approach leads to the object any more: then another trial follows, or the run is finished. A record that
+/// comes twice counts once.
+fn trials(records: &[TrialRecord], max_attempts: u32, is_finished: bool) -> (BTreeMap<u64, Trial<'_>>, usize) {
     let mut by_number: BTreeMap<u64, BTreeMap<u32, &TrialRecord>> = BTreeMap::new();
     for record in records {
         by_number.entry(record.trial).or_default().insert(record.attempt, record);
     }
     let n_begun = by_number.len();
+    let last_number = by_number.last_key_value().map_or(0, |(number, _)| *number);
     let ended: BTreeMap<u64, Trial<'_>> = by_number
         .into_iter()
         .filter_map(|(number, attempts)| {
@@ -257,7 +264,9 @@ pub(super) fn trials(records: &[TrialRecord], max_attempts: u32) -> (BTreeMap<u6
             let ending = match (last.lifted, last.held) {
                 (true, true) => Ending::Held,
                 (true, false) => Ending::Dropped,
-                (false, _) if last_attempt + 1 >= max_attempts => Ending::GivenUp,
+                (false, _) if is_finished || number < last_number || last_attempt + 1 >= max_attempts => {
+                    Ending::GivenUp
+                }
                 (false, _) => return None,
             };
             // Attempts are numbered without gaps.
@@ -343,22 +352,26 @@ pub(super) mod tests {
             ("mug, 0.43 kg", "mug", 0.43, "h"),
             ("mug, 0.93 kg", "mug", 0.93, "--d"),
             ("decorative rock", "rock", 0.28, "---"),
+            // No approach led to it any more.
+            ("lemon", "lemon", 0.06, "--"),
             ("decorative rock", "rock", 0.28, "-h"),
             // The run was stopped here.
             ("mug, 0.43 kg", "mug", 0.43, "-"),
         ]);
-        let found = Tallies::new(&records, 3);
+        let found = Tallies::new(&records, 3, false);
         let Tally { n_trials, n_attempts, n_lifts, n_held, n_given_up, .. } = found.total;
-        assert_eq!([n_trials, n_attempts, n_lifts, n_held, n_given_up], [4, 9, 3, 2, 1]);
-        assert_eq!(found.total.attempts_per_lift, Some(3.0));
-        assert_eq!(found.total.attempts_per_held, Some(4.5));
-        assert_eq!(found.n_unfinished, 1);
+        assert_eq!([n_trials, n_attempts, n_lifts, n_held, n_given_up], [5, 11, 3, 2, 2]);
+        assert_eq!(found.total.attempts_per_lift, Some(11.0 / 3.0));
+        assert_eq!(found.total.attempts_per_held, Some(5.5));
+        assert_eq!((found.n_reached, found.n_unfinished), (6, 1));
+        let finished = Tallies::new(&records, 3, true);
+        assert_eq!((finished.total.n_given_up, finished.n_reached, finished.n_unfinished), (3, 6, 0));
         assert_eq!(found.held_by_closure, [[2, 2], [0, 0], [0, 1]]);
         let closed = records.iter().map(|record| TrialRecord { epsilon: Some(0.07), ..record.clone() });
-        let closed = Tallies::new(&closed.collect::<Vec<_>>(), 3);
+        let closed = Tallies::new(&closed.collect::<Vec<_>>(), 3, false);
         assert_eq!(closed.held_by_closure, [[0, 0], [2, 3], [0, 0]], "the paper asks for more than 0.07");
         let without_hull = records.iter().map(|record| TrialRecord { epsilon: None, ..record.clone() });
-        let without_hull = Tallies::new(&without_hull.collect::<Vec<_>>(), 3);
+        let without_hull = Tallies::new(&without_hull.collect::<Vec<_>>(), 3, false);
         assert_eq!(without_hull.held_by_closure, [[0, 0]; 3], "a failed hull is no verdict");
         let mug = &found.groups[0];
         assert_eq!((mug.name.as_str(), mug.mass_kg, mug.paper), ("mug", [0.43, 0.93], Some([20, 20])));
@@ -367,22 +380,22 @@ pub(super) mod tests {
         // Wilson's interval of one in two, by hand: (0.5 + 1.9208) / (1 + 1.9207) ∓ ...
         let interval = success.interval.expect("lifts");
         assert!((interval.low - 0.0945).abs() < 1e-3 && (interval.high - 0.9055).abs() < 1e-3, "{interval:?}");
-        assert_eq!(found.groups.iter().map(|tally| tally.name.as_str()).collect::<Vec<_>>(), ["mug", "rock"]);
-        assert_eq!(found.things.len(), 3);
+        assert_eq!(found.groups.iter().map(|tally| tally.name.as_str()).collect::<Vec<_>>(), ["mug", "rock", "lemon"]);
+        assert_eq!(found.things.len(), 4);
     }
 
     #[test]
     fn nothing_is_nothing() {
-        let found = Tallies::new(&[], 20);
+        let found = Tallies::new(&[], 20, true);
         assert_eq!((found.total.n_trials, found.total.success, found.total.paper), (0, None, None));
-        assert_eq!(GateEffect::new(&[], &[], 20).attempts_ratio, None);
+        assert_eq!(GateEffect::new(&[], &[], 20, true).attempts_ratio, None);
     }
 
     #[test]
     fn a_record_that_comes_again_counts_once() {
         let mut twice = records(&[("box-02", "box", 0.1, "-h")]);
         twice.extend_from_within(..);
-        let found = Tallies::new(&twice, 20);
+        let found = Tallies::new(&twice, 20, true);
         assert_eq!((found.total.n_trials, found.total.n_attempts, found.total.paper), (1, 2, None));
     }
 
@@ -395,7 +408,7 @@ pub(super) mod tests {
         // stopped before it ended.
         let with = made(["--h", "----", "-d", "-d", "----", "-"]);
         let without = made(["d", "d", "d", "h", "h", "h"]);
-        let found = GateEffect::new(&with, &without, 4);
+        let found = GateEffect::new(&with, &without, 4, false);
         assert_eq!(
             found,
             GateEffect {

@@ -51,8 +51,9 @@ pub enum Doing {
     AsksForDecision { grasp_id: u64, n_before: usize },
     /// An attempt is over: its outcome is to be told, then [`Robot::conclude`] called.
     IsOver(Finished),
-    /// A trial is left out, because the hand cannot come to the target as it stands.
-    LeavesOut { trial: u64, why: TrialError },
+    /// A trial ends without a lift after so many attempts, because the hand cannot come to the target as it stands. Without an
+    /// attempt it is left out.
+    LeavesOut { trial: u64, n_attempts: u32, why: TrialError },
     /// All trials are done.
     IsDone,
 }
@@ -255,7 +256,7 @@ impl<'a> Robot<'a> {
         match self.target_and_attempt(&place) {
             Err(why @ TrialError::NoApproach { .. }) => {
                 self.course.leave_out();
-                Ok(Doing::LeavesOut { trial: place.trial, why })
+                Ok(Doing::LeavesOut { trial: place.trial, n_attempts: place.attempt, why })
             }
             drawn => {
                 let (target, attempt) = drawn?;
