@@ -121,12 +121,8 @@ impl Site for Ports {
         self.inputs[input].reader().put_back(sample);
     }
 
-    fn take_over(&mut self, input: usize, answered: Option<SampleId>) {
-        self.inputs[input].subscriber.take_over(answered);
-    }
-
-    fn take_over_at(&mut self, input: usize, saved: &Input) {
-        self.inputs[input].subscriber.take_over_at(saved.last, saved.counted, saved.counts);
+    fn take_over(&mut self, input: usize, place: &Input, cursor: Option<SampleId>) {
+        self.inputs[input].subscriber.take_over_at(place.last, place.counted, place.counts, cursor);
     }
 
     fn look_on_from(&mut self, input: usize, last: SampleId) {

@@ -287,6 +287,11 @@ impl Book {
         Ok(None)
     }
 
+    /// Drops the answers that were saved: they are made again.
+    pub(crate) fn forget_answers(&mut self) {
+        self.outputs.iter_mut().for_each(|output| output.kept = Kept::default());
+    }
+
     fn take_in(&mut self, mut found: Found<'_>, sent: &[Option<Written>]) {
         self.is_done = found.is_done;
         for input in &mut self.inputs {

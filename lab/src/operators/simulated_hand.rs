@@ -360,7 +360,7 @@ impl Inbox {
     fn resume(&mut self, last: Option<SampleId>, counts: InputCounts) {
         self.last = last;
         self.received.clear();
-        self.subscriber.take_over_at(last, last, counts);
+        self.subscriber.take_over_at(last, last, counts, last);
     }
 
     /// Whether something has come. It is not answered before [`Inbox::commit`].

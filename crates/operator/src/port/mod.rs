@@ -170,7 +170,7 @@ mod tests {
         subscriber.commit(&Header { seq: 0, epoch: 7, ..Header::default() });
         assert_eq!(cursors.input(INPUT).key(), key(1));
         let counts = InputCounts { n_received: 1, ..InputCounts::default() };
-        subscriber.take_over_at(key(0), key(0), counts);
+        subscriber.take_over_at(key(0), key(0), counts, key(0));
         assert_eq!((cursors.input(INPUT).key(), cursors.input(INPUT).counts()), (key(0), counts));
         assert_eq!(publisher.begin(false), key(1), "its own samples lie in its memory");
     }
