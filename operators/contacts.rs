@@ -8,7 +8,7 @@ use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::operator::{Operator, parse_params};
 use blindgrasp_operator::param::ParamKind;
-use blindgrasp_operator::stage::{self, Answers, STATE_FORMAT, Stage, encode_state};
+use blindgrasp_operator::stage::{self, Answers, Stage, decode_state, encode_state};
 use blindgrasp_stages::contacts::{ContactFinder, ContactSummary};
 use blindgrasp_stages::day::GraspPlace;
 use blindgrasp_stages::hand::Hand;
@@ -176,7 +176,9 @@ impl Stage for FindContacts {
 
     fn state(&self, bytes: &mut Vec<u8>) -> anyhow::Result<()> {
         match &self.watch {
-            Some(Watch { memory, reported, .. }) => encode_state((memory, reported.grasp, &reported.counts), bytes),
+            Some(Watch { memory, reported, .. }) => {
+                encode_state("contacts", (memory, reported.grasp, &reported.counts), bytes)
+            }
             None => Ok(()),
         }
     }
@@ -184,7 +186,7 @@ impl Stage for FindContacts {
     fn restore(&mut self, state: Option<&[u8]>) -> anyhow::Result<bool> {
         if let Some(watch) = &mut self.watch {
             let restored = match state {
-                Some(bytes) => bincode::serde::decode_from_slice(bytes, STATE_FORMAT)?.0,
+                Some(bytes) => decode_state("contacts", bytes)?,
                 None => (SensorMemory::default(), None, BTreeMap::new()),
             };
             (watch.memory, watch.reported.grasp, watch.reported.counts) = restored;

@@ -164,12 +164,12 @@ impl Worker<Sample> for Counter {
     }
 
     fn state(&self, bytes: &mut Vec<u8>) -> anyhow::Result<()> {
-        crate::stage::encode_state((self.model, self.n_samples, self.last), bytes)
+        crate::saved::put((self.model, self.n_samples, self.last), bytes)
     }
 
     fn restore(&mut self, state: Option<&[u8]>) -> anyhow::Result<bool> {
-        let saved = state.map(|bytes| bincode::serde::decode_from_slice(bytes, crate::stage::STATE_FORMAT));
-        let ((model, n_samples, last), _): ((u64, _, _), usize) = saved.transpose()?.unwrap_or_default();
+        let saved = state.map(|mut bytes| crate::saved::take(&mut bytes).expect("a state"));
+        let (model, n_samples, last): (u64, _, _) = saved.unwrap_or_default();
         (self.n_samples, self.last) = if model == self.model { (n_samples, last) } else { (0, None) };
         Ok(model == self.model)
     }
