@@ -967,6 +967,9 @@ fn name_of(input: &str, is_alone: bool, header: Header) -> SampleId {
 }
 
 #[cfg(test)]
+mod tests;
+
+#[cfg(test)]
 impl<T: std::hash::Hash> std::hash::Hash for Taken<T> {
     fn hash<H: std::hash::Hasher>(&self, state: &mut H) {
         (&self.sample, self.counts).hash(state);
