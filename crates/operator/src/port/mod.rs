@@ -64,7 +64,7 @@ pub fn sample_id(header: &Header) -> SampleId {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use std::os::unix::fs::PermissionsExt;
     use std::sync::Arc;
     use std::time::Duration;
@@ -95,7 +95,9 @@ mod tests {
     }
 
     /// Both ends of an edge in one process, and its cursors.
-    fn edge(folder: &std::path::Path) -> (Publisher<LiftDecision>, Subscriber<LiftDecision>, Arc<SharedCursors>) {
+    pub(crate) fn edge(
+        folder: &std::path::Path,
+    ) -> (Publisher<LiftDecision>, Subscriber<LiftDecision>, Arc<SharedCursors>, InputWiring) {
         std::fs::set_permissions(folder, std::fs::Permissions::from_mode(0o700)).expect("its own");
         let domain = NamespaceWiring { folder: folder.into() };
         std::fs::create_dir_all(domain.ports()).expect("a folder");
@@ -130,7 +132,7 @@ mod tests {
         };
         let publisher = Publisher::open(&node, &cursors, &output, 0).expect("opened");
         let subscriber = Subscriber::open(&node, Some(&cursors), &input).expect("opened");
-        (publisher, subscriber, cursors)
+        (publisher, subscriber, cursors, input)
     }
 
     fn head(seq: u64) -> <LiftDecision as Message>::Head {
@@ -141,7 +143,7 @@ mod tests {
     #[test]
     fn a_publisher_gives_way_to_its_own_reader_and_the_cursor_follows_the_saved_state() {
         let folder = tempfile::tempdir().expect("a folder");
-        let (mut publisher, mut subscriber, cursors) = edge(folder.path());
+        let (mut publisher, mut subscriber, cursors, _) = edge(folder.path());
         let key = |seq| Some(SampleId { epoch: 7, seq });
         publisher.begin(false);
         subscriber.take_over(None);
