@@ -101,7 +101,7 @@ impl Site for Desk {
         self.known[output]
     }
     fn written(&self, _: usize) -> Option<Written> {
-        None
+        self.sent.last().map(|sent| Written { last: sample_id(sent), first_seq: 0, before: None })
     }
     fn has_readers(&self, _: usize) -> bool {
         true
@@ -112,8 +112,13 @@ impl Site for Desk {
     fn wait_for_room(&mut self, _: usize, _: SampleId) -> Result<Sent, PortError> {
         Ok(if self.is_full { Sent::GaveWay } else { Sent::Yes })
     }
-    fn wait_for_answers(&mut self, _: usize, _: SampleId, _: Yields) -> Result<Sent, PortError> {
-        Ok(Sent::GaveWay)
+    fn wait_for_answers(&mut self, output: usize, key: SampleId, _: Yields) -> Result<Sent, PortError> {
+        self.say(format!("wait {output}.{}", key.seq));
+        if self.is_full {
+            return Ok(Sent::GaveWay);
+        }
+        self.known[output] = Some(key);
+        Ok(Sent::Yes)
     }
     fn send(&mut self, output: usize, key: SampleId, head: &[u8], _: &[u8]) -> Result<(), PortError> {
         self.sent.push(header_of(head));
@@ -442,4 +447,60 @@ fn a_standby_sends_its_answers_beside_and_is_warm_after_some_samples() {
     let beside: Vec<String> = (0..9).map(|seq| format!("beside 0.{seq}")).collect();
     assert_eq!(desk.said(), format!("{}, warm 8, {}", beside[..8].join(", "), beside[8]));
     assert!(!engine.is_active());
+}
+
+/// Two outputs with answers of 1,556 bytes that were sent and are kept, and those of the second one take more.
+fn book_of_kept_answers(desk: &mut Desk) -> Book {
+    let outputs = ["x", "y"].map(|name| Output::new(name, Numbers::Counted));
+    let mut book = Book::new(vec![], outputs.into());
+    for (output, seq) in [(0, 1), (1, 0), (1, 1)] {
+        book.keep(output, &header(seq), &[0; size_of::<Header>()], &[0; 1500]);
+        book.outputs[output].kept.has_sent_next();
+    }
+    desk.sent = vec![header(1)];
+    book
+}
+
+#[test]
+fn room_is_waited_for_where_most_is_kept_until_there_is_enough() {
+    for (n_bytes, is_full, expected) in [
+        (0, true, "wait 1.0"),
+        (0, false, "wait 1.0"),
+        (1000, false, "wait 1.0, wait 1.1"),
+        (9000, false, "wait 1.0, wait 1.1, wait 0.1"),
+    ] {
+        let mut desk = Desk { is_full, ..Desk::default() };
+        let mut book = book_of_kept_answers(&mut desk);
+        let sent = book.wait_for_room(&mut desk, n_bytes).expect("no error");
+        assert_eq!((desk.said().as_str(), sent), (expected, if is_full { Sent::GaveWay } else { Sent::Yes }));
+        let mut book = book_of_kept_answers(&mut desk);
+        desk.known = [None; 2];
+        let state = |bytes: &mut Vec<u8>| {
+            bytes.extend(vec![0; n_bytes]);
+            Ok(())
+        };
+        let sent = book.save(&mut desk, Yields::ToOthers, state).expect("no error");
+        let saved = if is_full { "" } else { ", save" };
+        assert_eq!(desk.said(), format!("{expected}{saved}"));
+        assert_eq!(sent, if is_full { Sent::GaveWay } else { Sent::Yes });
+    }
+}
+
+#[test]
+fn a_source_goes_on_after_its_saved_samples_unless_it_has_sent_more_since() {
+    let mut desk = Desk::default();
+    let mut book = book_of_kept_answers(&mut desk);
+    assert!(!book.is_done);
+    book.is_done = true;
+    assert_eq!(book.save(&mut desk, Yields::ToOthers, |_| Ok(())).expect("no error"), Sent::Yes);
+    for (sent, is_used) in [(1, true), (2, false)] {
+        desk.sent = vec![header(sent)];
+        let restored = book.restore(&desk, true).expect("it can be read");
+        assert_eq!((restored.is_some(), book.is_done), (is_used, is_used));
+        assert_eq!(book.next_key(1), id(sent + 1));
+    }
+    // A source in Rust has saved bytes of its own.
+    desk.saved = Some(b"mine".to_vec());
+    assert_eq!(book.restore(&desk, true).expect("not read"), None);
+    assert!(book.restore(&desk, false).is_err());
 }
