@@ -142,6 +142,11 @@ impl Retained {
         self.last = Some(key);
     }
 
+    /// The cursor has these counts by now: those of samples that came before must not take its place.
+    fn set_counts(&mut self, counts: InputCounts) {
+        self.samples.iter_mut().for_each(|(_, of_sample, _)| *of_sample = counts);
+    }
+
     /// Samples have left the timeline.
     pub(crate) fn leave(&mut self, n_samples: usize) {
         self.n_left += n_samples;
@@ -349,6 +354,7 @@ impl PartnerInput {
         }
         self.chosen = None;
         self.subscriber.take_over_all();
+        self.retained.set_counts(self.subscriber.counts());
     }
 
     /// Takes in the samples that have come. At the end of the stream, none stays behind.
@@ -521,7 +527,7 @@ mod tests {
     #[test]
     fn an_instance_that_is_active_again_has_the_partners_that_it_had() {
         let folder = tempfile::tempdir().expect("a folder");
-        let (mut publisher, subscriber, _, wiring) = crate::port::tests::edge(folder.path());
+        let (mut publisher, subscriber, cursors, wiring) = crate::port::tests::edge(folder.path());
         let port = InputPort { subscriber: subscriber.into_untyped(), onlooker: None };
         let mut input = PartnerInput::new("p", &wiring, Clock::Recording, port);
         publisher.begin(false);
@@ -539,6 +545,12 @@ mod tests {
             assert_eq!(stamp, Some(stamp_nanos));
             input.take_over();
         }
+        // The replacement has answered both.
+        let counts = InputCounts { n_received: 9, ..InputCounts::default() };
+        cursors.input(1).place_at(Some(SampleId { epoch: 7, seq: 1 }), &counts);
+        input.take_over();
+        input.commit_all();
+        assert_eq!(cursors.input(1).counts(), counts);
     }
 
     #[test]
