@@ -212,28 +212,25 @@ impl Operator {
     /// # Errors
     /// The wiring lacks the port, or iceoryx2 refuses it.
     pub fn publisher<M: Message>(&self, port: &str, max_items: usize) -> Result<Publisher<M>, OperatorError> {
-        Ok(self.enlist(Publisher::open(
-            &self.0.node,
-            &self.0.cursors,
-            wired(&self.0.wiring.outputs, port)?,
-            max_items,
-        )?))
+        self.publisher_for(port, Some(max_items))
     }
 
-    fn enlist<M: Message>(&self, mut publisher: Publisher<M>) -> Publisher<M> {
+    /// As [`Operator::publisher`]; without `max_items` for messages whose largest number of items is unknown.
+    ///
+    /// # Errors
+    /// The wiring lacks the port, or iceoryx2 refuses it.
+    pub fn publisher_for<M: Message>(
+        &self,
+        port: &str,
+        max_items: Option<usize>,
+    ) -> Result<Publisher<M>, OperatorError> {
+        let wiring = wired(&self.0.wiring.outputs, port)?;
+        let mut publisher = Publisher::open(&self.0.node, &self.0.cursors, wiring, max_items)?;
         if let Some(group) = &self.0.group {
             publisher.shares_process_with(group.input_slots.clone());
         }
         self.0.has_sent_all.borrow_mut().push(publisher.has_sent_all());
-        publisher
-    }
-
-    /// As [`Operator::publisher`], for messages whose largest number of items is unknown.
-    ///
-    /// # Errors
-    /// The wiring lacks the port, or iceoryx2 refuses it.
-    pub fn growing_publisher<M: Message>(&self, port: &str) -> Result<Publisher<M>, OperatorError> {
-        Ok(self.enlist(Publisher::open_growing(&self.0.node, &self.0.cursors, wired(&self.0.wiring.outputs, port)?)?))
+        Ok(publisher)
     }
 
     /// Whether an input is connected.

@@ -78,10 +78,7 @@ impl OutputPort {
         max_items: Option<usize>,
         is_compared: bool,
     ) -> Result<OutputPort, OperatorError> {
-        let publisher = match max_items {
-            Some(max_items) => operator.publisher::<M>(port, max_items)?,
-            None => operator.growing_publisher::<M>(port)?,
-        };
+        let publisher = operator.publisher_for::<M>(port, max_items)?;
         let shadow = if is_compared { Some(operator.shadow::<M>(port, max_items)?) } else { None };
         Ok(OutputPort { publisher: publisher.into_untyped(), shadow })
     }

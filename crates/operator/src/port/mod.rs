@@ -130,7 +130,7 @@ pub(crate) mod tests {
             slot: Some(INPUT),
             writer_slot: OUTPUT,
         };
-        let publisher = Publisher::open(&node, &cursors, &output, 0).expect("opened");
+        let publisher = Publisher::open(&node, &cursors, &output, Some(0)).expect("opened");
         let subscriber = Subscriber::open(&node, Some(&cursors), &input).expect("opened");
         (publisher, subscriber, cursors, input)
     }
