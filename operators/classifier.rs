@@ -8,7 +8,7 @@ use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::operator::{Operator, parse_params};
 use blindgrasp_operator::param::ParamKind;
-use blindgrasp_operator::stage::{self, Answers, STATE_FORMAT, Stage, encode_state};
+use blindgrasp_operator::stage::{self, Answers, Stage, decode_state, encode_state};
 use blindgrasp_stages::model::{Memory, Model};
 use blindgrasp_stages::own_lifts::{Adapt, OwnLifts};
 use blindgrasp_stages::steps;
@@ -104,15 +104,14 @@ impl Stage for Classify {
     }
 
     fn state(&self, bytes: &mut Vec<u8>) -> anyhow::Result<()> {
-        encode_state((self.dictionary_id, &self.model.checksum, &self.memory), bytes)
+        encode_state("classifier", (self.dictionary_id, &self.model.checksum, &self.memory), bytes)
     }
 
     fn restore(&mut self, state: Option<&[u8]>) -> anyhow::Result<bool> {
         self.memory = Memory::default();
         let mut is_of_this_model = false;
         if let Some(bytes) = state {
-            let ((dictionary_id, checksum, memory), _) =
-                bincode::serde::decode_from_slice::<(u64, String, Memory), _>(bytes, STATE_FORMAT)?;
+            let (dictionary_id, checksum, memory): (u64, String, Memory) = decode_state("classifier", bytes)?;
             // Features of another model say nothing to this one.
             if dictionary_id == self.dictionary_id {
                 self.memory = memory;

@@ -8,7 +8,7 @@ use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::operator::{Operator, parse_params};
 use blindgrasp_operator::param::ParamKind;
-use blindgrasp_operator::stage::{self, Answers, STATE_FORMAT, Stage, encode_state};
+use blindgrasp_operator::stage::{self, Answers, Stage, decode_state, encode_state};
 use blindgrasp_stages::contacts::{ContactFinder, ContactSummary};
 use blindgrasp_stages::day::GraspPlace;
 use blindgrasp_stages::glitches::GlitchFilter;
@@ -119,6 +119,9 @@ impl Flickering {
         self.has_counted = false;
     }
 }
+
+/// The state that is saved: of the filter and of the watch, as far as there are any.
+type State = (Option<GlitchFilter>, Option<(SensorMemory, Option<GraspPlace>, BTreeMap<String, u64>)>);
 
 /// Finds faulty sensors.
 struct Watch {
@@ -242,30 +245,23 @@ impl Stage for FindContacts {
     }
 
     fn state(&self, bytes: &mut Vec<u8>) -> anyhow::Result<()> {
-        if self.hand.median_filter {
-            encode_state(&self.filter, bytes)?;
+        if !self.has_state() {
+            return Ok(());
         }
-        match &self.watch {
-            Some(Watch { memory, reported, .. }) => encode_state((memory, reported.grasp, &reported.counts), bytes),
-            None => Ok(()),
-        }
+        let filter = self.hand.median_filter.then_some(&self.filter);
+        let watch =
+            self.watch.as_ref().map(|Watch { memory, reported, .. }| (memory, reported.grasp, &reported.counts));
+        encode_state("contacts", (filter, watch), bytes)
     }
 
     fn restore(&mut self, state: Option<&[u8]>) -> anyhow::Result<bool> {
-        let mut bytes = state;
-        self.filter = GlitchFilter::default();
-        if self.hand.median_filter
-            && let Some(all) = bytes
-        {
-            let (filter, n_read) = bincode::serde::decode_from_slice(all, STATE_FORMAT)?;
-            (self.filter, bytes) = (filter, Some(&all[n_read..]));
-        }
+        let saved: State = match state {
+            Some(bytes) if self.has_state() => decode_state("contacts", bytes)?,
+            _ => Default::default(),
+        };
+        self.filter = saved.0.unwrap_or_default();
         if let Some(watch) = &mut self.watch {
-            let restored = match bytes {
-                Some(bytes) => bincode::serde::decode_from_slice(bytes, STATE_FORMAT)?.0,
-                None => (SensorMemory::default(), None, BTreeMap::new()),
-            };
-            (watch.memory, watch.reported.grasp, watch.reported.counts) = restored;
+            (watch.memory, watch.reported.grasp, watch.reported.counts) = saved.1.unwrap_or_default();
         }
         Ok(state.is_some())
     }

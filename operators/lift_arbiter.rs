@@ -8,7 +8,7 @@ use blindgrasp_messages::{
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::{Operator, parse_params};
 use blindgrasp_operator::param::ParamKind;
-use blindgrasp_operator::stage::{self, Answers, STATE_FORMAT, Stage, encode_state};
+use blindgrasp_operator::stage::{self, Answers, Stage, decode_state, encode_state};
 use blindgrasp_operator::wiring::Clock;
 use blindgrasp_stages::lift_arbiter::{ArbiterOptions, ArbiterState, LiftArbiter, Probe};
 use blindgrasp_stages::promise_monitor::{OUTCOME_COUNTS, PromiseMonitor};
@@ -226,7 +226,7 @@ impl Stage for Arbiter {
     }
 
     fn state(&self, bytes: &mut Vec<u8>) -> anyhow::Result<()> {
-        encode_state((self.arbiter.state(), self.last, self.n_decisions, self.ended), bytes)
+        encode_state("lift_arbiter", (self.arbiter.state(), self.last, self.n_decisions, self.ended), bytes)
     }
 
     fn restore(&mut self, state: Option<&[u8]>) -> anyhow::Result<bool> {
@@ -235,7 +235,7 @@ impl Stage for Arbiter {
         // Silence counts from now: before, this instance did not listen.
         self.last_arrival_nanos = blindgrasp_operator::monotonic_nanos();
         let (state, last, n_decisions, ended): (ArbiterState, _, _, _) = match state {
-            Some(bytes) => bincode::serde::decode_from_slice(bytes, STATE_FORMAT)?.0,
+            Some(bytes) => decode_state("lift_arbiter", bytes)?,
             None => Default::default(),
         };
         self.ended = ended;

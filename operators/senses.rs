@@ -43,7 +43,7 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
     let mut has_warned = false;
     let stage = stage::from_fn::<TactileFrame, TactileFrame, _>(move |head, items, merged| {
         let sample = partner.sample();
-        let parts = sample.as_ref().map(|sample| sample.head.split(&sample.items)).transpose();
+        let parts = sample.as_ref().map(|sample| sample.head().split(sample.items())).transpose();
         if let Err(error) = &parts
             && !std::mem::replace(&mut has_warned, true)
         {

@@ -20,7 +20,7 @@ use blindgrasp_operator::operator::{Operator, TICK, parse_params};
 use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::port::Publisher;
 use blindgrasp_operator::source::{self, Source, Step, send};
-use blindgrasp_operator::stage::STATE_FORMAT;
+use blindgrasp_operator::stage::{decode_state, encode_state};
 use blindgrasp_operator::waiter::PollFd;
 use blindgrasp_stages::day::MAX_DAY;
 use blindgrasp_stages::hand::Hand;
@@ -389,7 +389,7 @@ impl TactileSource<'_> {
         // The first source of a graph begins its numbers.
         self.epoch = last.map_or_else(wall_nanos, |last| last.epoch);
         let place = match self.operator.saved_state() {
-            Some(bytes) => bincode::serde::decode_from_slice(&bytes, STATE_FORMAT)?.0,
+            Some(bytes) => decode_state("tactile_source", &bytes)?,
             None => Place::default(),
         };
         self.gate.resume(place, last.map(|last| last.seq));
@@ -411,7 +411,9 @@ impl TactileSource<'_> {
 
     fn send(&mut self, mut reading: Reading, accepted: Accepted) -> anyhow::Result<()> {
         // Saved first: an instance that takes over must not use the number of a grasp again.
-        self.operator.save_state(&bincode::serde::encode_to_vec(self.gate.place(), STATE_FORMAT)?)?;
+        let mut state = Vec::new();
+        encode_state("tactile_source", self.gate.place(), &mut state)?;
+        self.operator.save_state(&state)?;
         match self.zeros.apply(&mut reading) {
             Ok(Zeroed { is_below_zero, has_missing }) => {
                 self.of_zeros.below_zero += u64::from(is_below_zero);

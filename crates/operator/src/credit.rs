@@ -418,7 +418,7 @@ mod tests {
     }
 
     /// So many of the samples can be sent until the reader has no room.
-    fn n_sent(credit: &mut Credit, written: &mut Option<Written>, keys: &[SampleId], place: &Place) -> usize {
+    fn n_sent(credit: &mut Credit, written: &mut Option<Written>, keys: &[SampleId], place: &impl Places) -> usize {
         let is_sent = |key: &&SampleId| {
             let has_room = credit.first_without_room(place, *written, **key).is_none();
             if has_room {
@@ -460,6 +460,11 @@ mod tests {
         assert_eq!(send(&[3, 4, 4, 4, 4], place(3, 13)), 2);
         // It has answered all.
         assert_eq!(send(&[5, 6, 7, 8, 9], place(4, 16)), 4);
+        // Also in that of a reader behind another one.
+        let (mut credit, mut written) = (credit_of_chain(), None);
+        let places = Chain([Some(id(7, 9)), None], Some(id(7, 9)));
+        let sent: Vec<_> = ids(&[0, 0, 0, 1, 1]);
+        assert_eq!(n_sent(&mut credit, &mut written, &sent, &places), 4);
     }
 
     /// The places of two readers in a row, and the last sample that the first one has sent to the second.
@@ -539,8 +544,10 @@ mod tests {
         let written = Some(Written { last: id(7, 2), first_seq: 0, before: None });
         let places = Chain([Some(id(7, 0)); 2], Some(id(7, 0)));
         let mut credit = credit_of_chain();
+        assert!(credit.has_sent_all(None), "nothing was sent");
         credit.begin(true, &places, written);
         assert!(credit.has_sent_all(written));
+        assert_eq!(credit.readers_that_lack(id(7, 1), &Chain([None; 2], None), written).len(), 1);
         let mut credit = credit_of_chain();
         credit.begin(false, &places, written);
         assert!(!credit.has_sent_all(written));

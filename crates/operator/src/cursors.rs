@@ -545,13 +545,27 @@ mod tests {
         for seq in [0, 1, 1, 2] {
             mine.output(1).commit(SampleId { epoch: 7, seq });
         }
+        mine.output(1).add_blocked(4);
+        mine.output(1).add_blocked(5);
         let output = theirs.output(1);
         assert_eq!((output.key(), output.n_sent()), (Some(SampleId { epoch: 7, seq: 2 }), 3));
+        assert_eq!(output.blocked_nanos(), 9);
+        mine.input(0).give_up(true);
+        assert!(theirs.input(0).is_given_up());
+        mine.input(0).begin_after(None);
+        assert!(!theirs.input(0).is_given_up());
+        assert_eq!((theirs.input(0).key(), theirs.input(0).counts()), (None, InputCounts::default()));
+        for sample in [None, Some(key), None] {
+            mine.instance(2).works_on(sample);
+            assert_eq!(theirs.instance(2).sample(), sample);
+        }
         for state in [&b"one"[..], b"", b"three"] {
             assert!(mine.save_state(1, state));
             assert_eq!(theirs.state(1).as_deref(), Some(state));
         }
         assert_eq!(theirs.state(0), None);
+        assert!(mine.save_state(0, &vec![0; STATE_BYTES]));
+        mine.forget_state(0);
         assert!(!mine.save_state(1, &vec![0; STATE_BYTES + 1]));
         assert_eq!(theirs.state(1).as_deref(), Some(&b"three"[..]));
         mine.forget_state(0);
@@ -662,7 +676,10 @@ mod tests {
     fn another_file_is_refused() {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("alien");
-        for content in [vec![], vec![1; HEADER_BYTES]] {
+        let (_, own) = cursors(&folder);
+        let own = std::fs::read(own).expect("read");
+        let other = [&[0][..], &own[1..]].concat();
+        for content in [vec![], vec![1; HEADER_BYTES], other, own[..own.len() - 1].to_vec()] {
             std::fs::write(&path, content).expect("written");
             assert!(matches!(SharedCursors::open(&path), Err(CursorsError::Alien { .. })));
         }

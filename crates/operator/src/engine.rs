@@ -78,10 +78,9 @@ pub(crate) trait Site {
     fn receive(&mut self, input: usize) -> Result<Option<Received<Self::Sample>>, PortError>;
     /// Keeps a sample that was not answered until the input begins anew.
     fn put_back(&mut self, input: usize, sample: Self::Sample);
-    /// Begins an input anew, as the active instance: see [`Subscriber::take_over`](crate::port::UntypedSubscriber::take_over).
-    fn take_over(&mut self, input: usize, answered: Option<SampleId>);
-    /// Begins an input anew at its saved place.
-    fn take_over_at(&mut self, input: usize, saved: &Input);
+    /// Begins an input anew after the last sample of a place, as the active instance. Its cursor says from now on that it has
+    /// answered the samples up to `cursor`.
+    fn take_over(&mut self, input: usize, place: &Input, cursor: Option<SampleId>);
     /// Begins an input anew, as a standby that has its state from after this sample.
     fn look_on_from(&mut self, input: usize, last: SampleId);
     fn commit(&mut self, input: usize, key: SampleId, counts: &InputCounts);
@@ -796,9 +795,6 @@ impl<T: Sample, W: Worker<T>> Engine<T, W> {
         for (idx, output) in self.book.outputs.iter_mut().enumerate() {
             output.known = site.begin(idx, is_handed_over);
         }
-        if !self.manner.saves {
-            site.forget_state();
-        }
         let has_handed_over = self.handed_over.is_some();
         let is_restored = self.restore(site)?;
         if has_handed_over && is_restored {
@@ -810,7 +806,7 @@ impl<T: Sample, W: Worker<T>> Engine<T, W> {
             self.begin_after_readers(site, has_handed_over)?;
         } else {
             for (idx, input) in self.book.inputs.iter().enumerate() {
-                site.take_over_at(idx, input);
+                site.take_over(idx, input, input.last);
             }
         }
         self.last = self.book.inputs.first().and_then(|input| input.last);
@@ -824,7 +820,10 @@ impl<T: Sample, W: Worker<T>> Engine<T, W> {
         let input = &mut self.book.inputs[0];
         if !self.manner.saves {
             input.last = least;
-            site.take_over(0, least);
+            // An instance with state, which was before it, may have counted samples that it was to answer again. Only its saved
+            // state said so; from now on the cursor does.
+            site.take_over(0, input, input.counted);
+            site.forget_state();
             return Ok(());
         }
         // Readers are ahead if the instance before has sent an answer and not committed its sample, which is not counted then.
@@ -836,7 +835,8 @@ impl<T: Sample, W: Worker<T>> Engine<T, W> {
             // failure the state of the hand-over.
             self.save_if_it_fits(site)?;
         }
-        site.take_over_at(0, &self.book.inputs[0]);
+        let input = &self.book.inputs[0];
+        site.take_over(0, input, input.last);
         Ok(())
     }
 
@@ -865,7 +865,12 @@ impl<T: Sample, W: Worker<T>> Engine<T, W> {
     /// failed replacement has left no state that the worker can use, the worker goes on with the state with which it handed
     /// over. The places stay those of the replacement.
     fn restore<S: Site<Sample = T>>(&mut self, site: &S) -> anyhow::Result<bool> {
-        let saved = if self.manner.saves { self.book.restore(site, false)? } else { None };
+        let mut saved = self.book.restore(site, false)?;
+        if !self.manner.saves {
+            // Of another instance's saved state, it needs the places alone.
+            self.book.forget_answers();
+            saved = None;
+        }
         let Some(own) = self.handed_over.take() else {
             self.worker.restore(saved.as_deref())?;
             return Ok(saved.is_some());
@@ -960,6 +965,9 @@ fn name_of(input: &str, is_alone: bool, header: Header) -> SampleId {
     let epoch = if is_alone { epoch } else { epoch ^ stable_hash(&[input]) };
     SampleId { epoch, seq }
 }
+
+#[cfg(test)]
+mod tests;
 
 #[cfg(test)]
 impl<T: std::hash::Hash> std::hash::Hash for Taken<T> {

@@ -7,6 +7,7 @@
 use std::cell::{Cell, RefCell};
 use std::collections::{BTreeMap, VecDeque};
 use std::io::Write;
+use std::marker::PhantomData;
 use std::process::ExitCode;
 use std::rc::Rc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -23,9 +24,10 @@ use crate::description::{LINK_OPERATOR, OperatorDescription};
 use crate::descriptors::DescriptorWatch;
 use crate::diagnostics::{print_diagnostic, with_lack_of_files};
 use crate::link_status::LinkStatus;
-use crate::partner::{PairedInput, Partner, PartnerInput};
+use crate::partner::{Partner, PartnerInput};
 use crate::port::{PortError, Publisher, ShadowPublisher, Subscriber};
 use crate::private_service::PrivateService;
+use crate::runner::InputPort;
 use crate::sandbox::Sandbox;
 use crate::waiter::{PollFd, Waiter, Waker};
 use crate::wiring::{
@@ -60,7 +62,7 @@ struct Member {
     descriptors: Option<RefCell<DescriptorWatch>>,
     voice: Voice,
     /// The partner inputs, and the counts of its own that it has reported.
-    partners: RefCell<Vec<Rc<RefCell<dyn PairedInput>>>>,
+    partners: RefCell<Vec<Rc<RefCell<PartnerInput>>>>,
     counts: RefCell<BTreeMap<String, u64>>,
     /// Of each output, whether all samples that are not answered can be received.
     has_sent_all: RefCell<Vec<Arc<AtomicBool>>>,
@@ -215,28 +217,25 @@ impl Operator {
     /// # Errors
     /// The wiring lacks the port, or iceoryx2 refuses it.
     pub fn publisher<M: Message>(&self, port: &str, max_items: usize) -> Result<Publisher<M>, OperatorError> {
-        Ok(self.enlist(Publisher::open(
-            &self.0.node,
-            &self.0.cursors,
-            wired(&self.0.wiring.outputs, port)?,
-            max_items,
-        )?))
+        self.publisher_for(port, Some(max_items))
     }
 
-    fn enlist<M: Message>(&self, mut publisher: Publisher<M>) -> Publisher<M> {
+    /// As [`Operator::publisher`]; without `max_items` for messages whose largest number of items is unknown.
+    ///
+    /// # Errors
+    /// The wiring lacks the port, or iceoryx2 refuses it.
+    pub fn publisher_for<M: Message>(
+        &self,
+        port: &str,
+        max_items: Option<usize>,
+    ) -> Result<Publisher<M>, OperatorError> {
+        let wiring = wired(&self.0.wiring.outputs, port)?;
+        let mut publisher = Publisher::open(&self.0.node, &self.0.cursors, wiring, max_items)?;
         if let Some(group) = &self.0.group {
             publisher.shares_process_with(group.input_slots.clone());
         }
         self.0.has_sent_all.borrow_mut().push(publisher.has_sent_all());
-        publisher
-    }
-
-    /// As [`Operator::publisher`], for messages whose largest number of items is unknown.
-    ///
-    /// # Errors
-    /// The wiring lacks the port, or iceoryx2 refuses it.
-    pub fn growing_publisher<M: Message>(&self, port: &str) -> Result<Publisher<M>, OperatorError> {
-        Ok(self.enlist(Publisher::open_growing(&self.0.node, &self.0.cursors, wired(&self.0.wiring.outputs, port)?)?))
+        Ok(publisher)
     }
 
     /// Whether an input is connected.
@@ -282,15 +281,18 @@ impl Operator {
     /// # Errors
     /// The wiring lacks the port, or iceoryx2 refuses it.
     pub fn partner<M: Message>(&self, port: &str) -> Result<Partner<M>, OperatorError> {
-        let onlooker = self.begins_as_standby().then(|| self.onlooker(port)).transpose()?;
-        let wiring = wired(&self.0.wiring.inputs, port)?;
-        let input = PartnerInput::new(port, wiring, self.clock(), self.subscriber(port)?, onlooker);
-        let input = Rc::new(RefCell::new(input));
-        self.0.partners.borrow_mut().push(Rc::clone(&input) as Rc<RefCell<dyn PairedInput>>);
-        Ok(Partner(input))
+        let input = InputPort::open::<M>(self, port, self.begins_as_standby())?;
+        Ok(Partner { input: self.add_partner(port, input)?, message: PhantomData })
     }
 
-    pub(crate) fn partners(&self) -> Vec<Rc<RefCell<dyn PairedInput>>> {
+    pub(crate) fn add_partner(&self, port: &str, input: InputPort) -> Result<Rc<RefCell<PartnerInput>>, OperatorError> {
+        let wiring = wired(&self.0.wiring.inputs, port)?;
+        let input = Rc::new(RefCell::new(PartnerInput::new(port, wiring, self.clock(), input)));
+        self.0.partners.borrow_mut().push(Rc::clone(&input));
+        Ok(input)
+    }
+
+    pub(crate) fn partners(&self) -> Vec<Rc<RefCell<PartnerInput>>> {
         self.0.partners.borrow().clone()
     }
 

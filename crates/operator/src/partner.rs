@@ -11,13 +11,15 @@
 
 use std::cell::{Ref, RefCell};
 use std::collections::VecDeque;
+use std::marker::PhantomData;
 use std::rc::Rc;
 use std::time::{Duration, Instant};
 
 use crate::cursors::SampleId;
 use crate::monotonic_nanos;
 use crate::operator::Operator;
-use crate::port::{PortError, Subscriber, sample_id};
+use crate::port::{PortError, UntypedSample, UntypedSubscriber, sample_id};
+use crate::runner::InputPort;
 use crate::wiring::{Clock, InputCounts, InputWiring};
 use blindgrasp_messages::{Header, Message};
 
@@ -74,27 +76,28 @@ impl<T> Timeline<T> {
 
     /// Chooses the sample nearest to this stamp, the earlier one of two: its index in the first segment. Samples that later
     /// stamps do not need are taken out.
-    fn choose(&mut self, stamp_nanos: u64, mut forget: impl FnMut(T)) -> Option<usize> {
+    fn choose(&mut self, stamp_nanos: u64) -> Option<usize> {
         let tolerance_nanos = self.tolerance_nanos;
         let at = match self.covering(stamp_nanos) {
             Some(at) => at,
             None => self.segments.iter().position(|one| one.nearest(stamp_nanos, tolerance_nanos).is_some())?,
         };
-        let earlier = self.segments.drain(..at).flat_map(|segment| segment.kept);
-        earlier.for_each(|(_, sample)| forget(sample));
+        self.segments.drain(..at);
         let segment = self.segments.front_mut()?;
         while segment.kept.front().is_some_and(|(first, _)| first.saturating_add(tolerance_nanos) < stamp_nanos) {
-            segment.pop().into_iter().for_each(&mut forget);
+            segment.pop();
         }
         segment.nearest(stamp_nanos, tolerance_nanos)
     }
 
     /// Takes out the first sample.
-    fn pop(&mut self) -> Option<T> {
+    fn pop(&mut self) {
         if self.segments.len() > 1 && self.segments.front().is_some_and(|first| first.kept.is_empty()) {
             self.segments.pop_front();
         }
-        self.segments.front_mut()?.pop()
+        if let Some(first) = self.segments.front_mut() {
+            first.pop();
+        }
     }
 }
 
@@ -106,10 +109,10 @@ impl<T> Segment<T> {
         (nearest.0 <= tolerance_nanos).then_some(nearest.1)
     }
 
-    fn pop(&mut self) -> Option<T> {
-        let (stamp_nanos, sample) = self.kept.pop_front()?;
-        self.from_nanos = stamp_nanos + 1;
-        Some(sample)
+    fn pop(&mut self) {
+        if let Some((stamp_nanos, _)) = self.kept.pop_front() {
+            self.from_nanos = stamp_nanos + 1;
+        }
     }
 }
 
@@ -137,6 +140,11 @@ impl Retained {
     pub(crate) fn receive(&mut self, key: SampleId, counts: InputCounts, now_nanos: u64) {
         self.samples.push_back((key, counts, now_nanos));
         self.last = Some(key);
+    }
+
+    /// The cursor has these counts by now: those of samples that came before must not take its place.
+    fn set_counts(&mut self, counts: InputCounts) {
+        self.samples.iter_mut().for_each(|(_, of_sample, _)| *of_sample = counts);
     }
 
     /// Samples have left the timeline.
@@ -173,37 +181,52 @@ impl Retained {
 }
 
 /// A sample of a partner input.
-#[derive(Debug)]
-pub struct PartnerSample<M: Message> {
-    pub head: M::Head,
-    pub items: Vec<M::Item>,
+pub struct PartnerSample<'a, M: Message> {
+    sample: Ref<'a, UntypedSample>,
+    message: PhantomData<M>,
 }
 
-/// A partner input, for the stage: see [`Operator::partner`](crate::Operator::partner).
-pub struct Partner<M: Message>(pub(crate) Rc<RefCell<PartnerInput<M>>>);
+impl<M: Message> PartnerSample<'_, M> {
+    pub fn head(&self) -> &M::Head {
+        self.sample.beginning()
+    }
 
-impl<M: Message> Partner<M> {
-    /// The sample that belongs to the one that is answered just now; `None` if none came in time, or none is near enough.
-    pub fn sample(&self) -> Option<Ref<'_, PartnerSample<M>>> {
-        Ref::filter_map(self.0.borrow(), |input| {
-            let (_, sample) = input.timeline.segments.front()?.kept.get(input.chosen?)?;
-            Some(sample)
-        })
-        .ok()
+    pub fn items(&self) -> &[M::Item] {
+        self.sample.items()
     }
 }
 
+/// A partner input, for the stage: see [`Operator::partner`](crate::Operator::partner).
+pub struct Partner<M: Message> {
+    pub(crate) input: Rc<RefCell<PartnerInput>>,
+    pub(crate) message: PhantomData<M>,
+}
+
+impl<M: Message> Partner<M> {
+    /// The sample that belongs to the one that is answered just now; `None` if none came in time, or none is near enough.
+    pub fn sample(&self) -> Option<PartnerSample<'_, M>> {
+        Some(PartnerSample { sample: chosen(&self.input)?, message: PhantomData })
+    }
+}
+
+/// As [`Partner::sample`], of an input whatever its message.
+pub(crate) fn chosen(input: &RefCell<PartnerInput>) -> Option<Ref<'_, UntypedSample>> {
+    let chosen = Ref::filter_map(input.borrow(), |input| {
+        let (_, sample) = input.timeline.segments.front()?.kept.get(input.chosen?)?;
+        Some(sample)
+    });
+    chosen.ok()
+}
+
 /// A partner input, for the operator that runs the stage.
-pub(crate) struct PartnerInput<M: Message> {
+pub(crate) struct PartnerInput {
     port: String,
     retained: Retained,
-    subscriber: Subscriber<M>,
+    subscriber: UntypedSubscriber,
     /// The reader of a standby.
-    onlooker: Option<Subscriber<M>>,
-    timeline: Timeline<PartnerSample<M>>,
+    onlooker: Option<UntypedSubscriber>,
+    timeline: Timeline<UntypedSample>,
     chosen: Option<usize>,
-    /// Memory of items that are needed no more.
-    spare: Vec<Vec<M::Item>>,
     clock: Clock,
     wait: Duration,
     /// When the main input's last sample was answered.
@@ -211,43 +234,9 @@ pub(crate) struct PartnerInput<M: Message> {
     n_without: u64,
 }
 
-/// A partner input of any type.
-pub(crate) trait PairedInput {
-    /// Looks for its writers.
-    fn connect(&mut self) -> Result<(), PortError>;
-
-    /// Commits the samples that are needed no more: samples of the main input up to `main` will not be answered again.
-    fn commit(&mut self, main: Option<SampleId>);
-
-    /// Commits all samples.
-    fn commit_all(&mut self);
-
-    /// Goes on as the reader of the active instance.
-    fn take_over(&mut self);
-
-    /// Takes in the samples that have come. At the end of the stream, none stays behind.
-    fn take_in(&mut self, is_active: bool, is_ending: bool) -> Result<(), PortError>;
-
-    /// The time at which a main sample that was looked at first at `since` is answered without its partner; `None` if the
-    /// partner is known.
-    fn waits_until(&self, main: &Header, since: Instant) -> Option<Instant>;
-
-    /// Chooses the partner of a main sample that is about to be answered. A standby does not count.
-    fn choose(&mut self, main: &Header, is_active: bool);
-
-    /// Whether all samples that its writer has sent were received.
-    fn is_caught_up(&self) -> bool;
-
-    /// When an early sample that it reads is due.
-    fn hold_deadline(&self, is_active: bool) -> Option<Instant>;
-
-    /// The port, and how many main samples were answered without a partner.
-    fn n_without(&self) -> (&str, u64);
-}
-
 /// The partner inputs of a stage.
 pub(crate) struct Partners {
-    inputs: Vec<Rc<RefCell<dyn PairedInput>>>,
+    inputs: Vec<Rc<RefCell<PartnerInput>>>,
     /// The main sample that waits for its partners, since when, and until when.
     waiting: Option<(SampleId, Instant, Instant)>,
     /// The counts that were reported last.
@@ -320,34 +309,26 @@ impl Partners {
 
     /// Reports how many samples were answered without a partner.
     pub(crate) fn report(&mut self, operator: &Operator) {
-        let n_without = self.inputs.iter().map(|input| input.borrow().n_without().1).sum();
+        let n_without = self.inputs.iter().map(|input| input.borrow().n_without).sum();
         if std::mem::replace(&mut self.n_without, n_without) != n_without {
             let counts = self.inputs.iter().map(|input| {
                 let input = input.borrow();
-                let (port, n) = input.n_without();
-                (format!("{port}_without_partner"), n)
+                (format!("{}_without_partner", input.port), input.n_without)
             });
             operator.has_counted(counts.collect());
         }
     }
 }
 
-impl<M: Message> PartnerInput<M> {
-    pub(crate) fn new(
-        port: &str,
-        wiring: &InputWiring,
-        clock: Clock,
-        subscriber: Subscriber<M>,
-        onlooker: Option<Subscriber<M>>,
-    ) -> Self {
+impl PartnerInput {
+    pub(crate) fn new(port: &str, wiring: &InputWiring, clock: Clock, input: InputPort) -> Self {
         PartnerInput {
             port: port.into(),
             retained: Retained::new(wiring.capacity),
-            subscriber,
-            onlooker,
+            subscriber: input.subscriber,
+            onlooker: input.onlooker,
             timeline: Timeline::new(wiring.tolerance_nanos),
             chosen: None,
-            spare: Vec::with_capacity(MAX_KEPT),
             clock,
             wait: match clock {
                 Clock::Machine => Duration::from_nanos(wiring.partner_wait_nanos),
@@ -357,22 +338,26 @@ impl<M: Message> PartnerInput<M> {
             n_without: 0,
         }
     }
-}
 
-impl<M: Message> PairedInput for PartnerInput<M> {
+    /// Looks for its writers.
     fn connect(&mut self) -> Result<(), PortError> {
         self.onlooker.as_mut().map_or(Ok(false), |onlooker| onlooker.connect())?;
         self.subscriber.connect().map(|_| ())
     }
 
+    /// Goes on as the reader of the active instance.
     fn take_over(&mut self) {
-        self.onlooker = None;
-        self.retained = Retained::new(self.retained.n_most);
-        self.timeline.segments.clear();
+        // The samples of a standby are its own copies. One that is active again goes on with those that it has received: they do
+        // not come again.
+        if self.onlooker.take().is_some() {
+            self.timeline.segments.clear();
+        }
         self.chosen = None;
         self.subscriber.take_over_all();
+        self.retained.set_counts(self.subscriber.counts());
     }
 
+    /// Takes in the samples that have come. At the end of the stream, none stays behind.
     fn take_in(&mut self, is_active: bool, is_ending: bool) -> Result<(), PortError> {
         // In a replay the other input may be far behind: the writer of this one waits.
         let may_forget = self.clock == Clock::Machine || is_ending || self.last_answer.elapsed() > RECORDING_LIMIT;
@@ -382,7 +367,7 @@ impl<M: Message> PairedInput for PartnerInput<M> {
                     return Ok(());
                 }
                 self.chosen = None;
-                self.spare.extend(self.timeline.pop().map(|sample| sample.items));
+                self.timeline.pop();
                 self.retained.leave(1);
                 self.commit(None);
             }
@@ -397,19 +382,17 @@ impl<M: Message> PairedInput for PartnerInput<M> {
                 }
                 return Ok(());
             };
-            let head = *sample.head();
-            let mut items = self.spare.pop().unwrap_or_default();
-            items.clear();
-            items.extend_from_slice(sample.items());
-            drop(sample);
+            let header = *sample.header();
             if is_active {
-                self.retained.receive(sample_id(M::header(&head)), self.subscriber.counts(), monotonic_nanos());
+                self.retained.receive(sample_id(&header), self.subscriber.counts(), monotonic_nanos());
                 self.commit(None);
             }
-            self.timeline.push(M::header(&head).stamp_nanos, PartnerSample { head, items });
+            self.timeline.push(header.stamp_nanos, sample.copied());
         }
     }
 
+    /// The time at which a main sample that was looked at first at `since` is answered without its partner; `None` if the
+    /// partner is known.
     fn waits_until(&self, main: &Header, since: Instant) -> Option<Instant> {
         if self.timeline.covering(main.stamp_nanos).is_some() {
             return None;
@@ -424,10 +407,11 @@ impl<M: Message> PairedInput for PartnerInput<M> {
         (!left.is_zero()).then(|| Instant::now() + left)
     }
 
+    /// Chooses the partner of a main sample that is about to be answered. A standby does not count.
     fn choose(&mut self, main: &Header, is_active: bool) {
         self.last_answer = Instant::now();
-        let (spare, n_before) = (&mut self.spare, self.timeline.len());
-        self.chosen = self.timeline.choose(main.stamp_nanos, |sample| spare.push(sample.items));
+        let n_before = self.timeline.len();
+        self.chosen = self.timeline.choose(main.stamp_nanos);
         if is_active {
             self.retained.leave(n_before - self.timeline.len());
             self.retained.answer(sample_id(main));
@@ -435,10 +419,12 @@ impl<M: Message> PairedInput for PartnerInput<M> {
         self.n_without += u64::from(is_active && self.chosen.is_none());
     }
 
+    /// Whether all samples that its writer has sent were received.
     fn is_caught_up(&self) -> bool {
         self.subscriber.is_caught_up() || self.subscriber.written() == self.retained.last
     }
 
+    /// Commits the samples that are needed no more: samples of the main input up to `main` will not be answered again.
     fn commit(&mut self, main: Option<SampleId>) {
         let until_nanos = monotonic_nanos().saturating_sub(RETAIN_LIMIT.as_nanos() as u64);
         if let Some((key, counts)) = self.retained.commit_point(main, until_nanos) {
@@ -446,27 +432,27 @@ impl<M: Message> PairedInput for PartnerInput<M> {
         }
     }
 
+    /// Commits all samples.
     fn commit_all(&mut self) {
         if let Some((key, counts)) = self.retained.commit_all() {
             self.subscriber.commit_late(key, &counts);
         }
     }
 
+    /// When an early sample that it reads is due.
     fn hold_deadline(&self, is_active: bool) -> Option<Instant> {
         if is_active { self.subscriber.hold_deadline() } else { self.onlooker.as_ref()?.hold_deadline() }
-    }
-
-    fn n_without(&self) -> (&str, u64) {
-        (&self.port, self.n_without)
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use blindgrasp_messages::LiftDecision;
     use rand::{RngExt, SeedableRng};
     use rand_chacha::ChaCha8Rng;
 
     use super::*;
+    use crate::port::Sent;
 
     fn timeline(stamps: impl IntoIterator<Item = u64>, tolerance_nanos: u64) -> Timeline<u64> {
         let mut timeline = Timeline::new(tolerance_nanos);
@@ -475,7 +461,7 @@ mod tests {
     }
 
     fn partner(timeline: &mut Timeline<u64>, stamp: u64) -> Option<u64> {
-        let idx = timeline.choose(stamp, drop)?;
+        let idx = timeline.choose(stamp)?;
         Some(timeline.segments[0].kept[idx].1)
     }
 
@@ -535,6 +521,36 @@ mod tests {
                 }
             }
         }
+    }
+
+    /// Its replacement has failed. The samples that it has received lie in no queue any more.
+    #[test]
+    fn an_instance_that_is_active_again_has_the_partners_that_it_had() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let (mut publisher, subscriber, cursors, wiring) = crate::port::tests::edge(folder.path());
+        let port = InputPort { subscriber: subscriber.into_untyped(), onlooker: None };
+        let mut input = PartnerInput::new("p", &wiring, Clock::Recording, port);
+        publisher.begin(false);
+        input.take_over();
+        input.connect().expect("connected");
+        for stamp_nanos in 0..2 {
+            let header = Header { seq: stamp_nanos, epoch: 7, stamp_nanos, ..Header::default() };
+            let (head, _) = LiftDecision::default().to_parts(header);
+            assert_eq!(publisher.send(head, &[], &mut || false).expect("no error"), Sent::Yes);
+        }
+        for stamp_nanos in 0..2 {
+            input.take_in(true, false).expect("taken in");
+            input.choose(&Header { stamp_nanos, ..Header::default() }, true);
+            let stamp = input.chosen.map(|idx| input.timeline.segments[0].kept[idx].0);
+            assert_eq!(stamp, Some(stamp_nanos));
+            input.take_over();
+        }
+        // The replacement has answered both.
+        let counts = InputCounts { n_received: 9, ..InputCounts::default() };
+        cursors.input(1).place_at(Some(SampleId { epoch: 7, seq: 1 }), &counts);
+        input.take_over();
+        input.commit_all();
+        assert_eq!(cursors.input(1).counts(), counts);
     }
 
     #[test]

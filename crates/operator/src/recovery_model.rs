@@ -78,6 +78,8 @@ struct Budget {
     is_live: bool,
     /// The stages have a partner input.
     has_partners: bool,
+    /// The instances of the node without state have none and one in turn.
+    alternates: bool,
 }
 
 /// A sample on its way. It is `made_by` the process that has decided it.
@@ -162,12 +164,12 @@ impl Worker<Sample> for Counter {
     }
 
     fn state(&self, bytes: &mut Vec<u8>) -> anyhow::Result<()> {
-        crate::stage::encode_state((self.model, self.n_samples, self.last), bytes)
+        crate::saved::put((self.model, self.n_samples, self.last), bytes)
     }
 
     fn restore(&mut self, state: Option<&[u8]>) -> anyhow::Result<bool> {
-        let saved = state.map(|bytes| bincode::serde::decode_from_slice(bytes, crate::stage::STATE_FORMAT));
-        let ((model, n_samples, last), _): ((u64, _, _), usize) = saved.transpose()?.unwrap_or_default();
+        let saved = state.map(|mut bytes| crate::saved::take(&mut bytes).expect("a state"));
+        let (model, n_samples, last): (u64, _, _) = saved.unwrap_or_default();
         (self.n_samples, self.last) = if model == self.model { (n_samples, last) } else { (0, None) };
         Ok(model == self.model)
     }
@@ -254,8 +256,8 @@ struct World {
     nodes: [Node; 4],
     slots: Slots,
     counts: [InputCounts; 4],
-    /// The saved state of the stage with state.
-    saved: Option<Vec<u8>>,
+    /// The saved state of each node.
+    saved: [Option<Vec<u8>>; 4],
     heard: Vec<Sample>,
     decided: Vec<Sample>,
     /// The processes that each node has had.
@@ -341,7 +343,7 @@ impl Search {
             nodes: Default::default(),
             slots: Slots::default(),
             counts: Default::default(),
-            saved: None,
+            saved: Default::default(),
             heard: Vec::new(),
             decided: Vec::new(),
             n_processes: [0; 4],
@@ -941,7 +943,7 @@ impl<'a> At<'a> {
 
     /// A stage that stands by.
     fn standby(&mut self, model: u64) -> Engine<Sample, Counter> {
-        let has_state = self.node == STATEFUL;
+        let has_state = self.node == STATEFUL || self.search.budget.alternates && self.process().id % 2 == 1;
         let book = Book::new(vec![Input::new("in", false)], vec![Output::new("out", Numbers::OfWorker)]);
         let worker = Counter { has_state, model, n_samples: 0, last: None, answer: None, is_broken: false };
         let manner = Manner { saves: has_state, answers_each: true, n_batch: 1, has_suspect: false };
@@ -971,14 +973,9 @@ impl Site for At<'_> {
         self.process().put_back.push(sample);
     }
 
-    fn take_over(&mut self, _: usize, answered: Option<SampleId>) {
-        let (counted, counts) = self.place(0);
-        self.search.begin_with(self.world, self.node, Sequencer::resume(answered, counted, counts));
-    }
-
-    fn take_over_at(&mut self, _: usize, saved: &Input) {
-        (self.world.slots.answered[self.node], self.world.counts[self.node]) = (saved.last, saved.counts);
-        let sequencer = Sequencer::resume(saved.last, saved.counted, saved.counts);
+    fn take_over(&mut self, _: usize, place: &Input, cursor: Option<SampleId>) {
+        (self.world.slots.answered[self.node], self.world.counts[self.node]) = (cursor, place.counts);
+        let sequencer = Sequencer::resume(place.last, place.counted, place.counts);
         self.search.begin_with(self.world, self.node, sequencer);
     }
 
@@ -1094,15 +1091,17 @@ impl Site for At<'_> {
     fn save_state(&mut self, bytes: &[u8]) -> anyhow::Result<()> {
         anyhow::ensure!(bytes.len() <= STATE_BYTES, "a state of {} bytes", bytes.len());
         self.has_stored = true;
-        self.world.saved = Some(bytes.to_vec());
+        self.world.saved[self.node] = Some(bytes.to_vec());
         Ok(())
     }
 
     fn saved_state(&self) -> Option<Vec<u8>> {
-        self.world.saved.clone()
+        self.world.saved[self.node].clone()
     }
 
-    fn forget_state(&mut self) {}
+    fn forget_state(&mut self) {
+        self.world.saved[self.node] = None;
+    }
 
     fn is_interrupted(&self) -> bool {
         false
@@ -1152,6 +1151,7 @@ const KILLS: Budget = Budget {
     skipped: None,
     is_live: false,
     has_partners: false,
+    alternates: false,
 };
 const SWAP: Budget = Budget { n_kills: 1, n_swaps: 1, ..KILLS };
 const LATE: Budget = Budget { n_kills: 1, n_late: 1, ..KILLS };
@@ -1175,7 +1175,13 @@ fn assert_whole(budgets: &[Budget]) {
 #[test]
 fn kills_swaps_and_late_connections_lose_and_repeat_nothing() {
     let swap_of = |node| Budget { node: Some(node), ..SWAP };
-    assert_whole(&[Budget { n_kills: 1, ..KILLS }, swap_of(SOURCE), swap_of(STATELESS), swap_of(STATEFUL), LATE]);
+    assert_whole(&[swap_of(SOURCE), swap_of(STATELESS), swap_of(STATEFUL), LATE]);
+}
+
+/// The places of an instance with state are in its saved state, those of one without are the cursors.
+#[test]
+fn instances_with_and_without_state_in_turn_count_each_sample_once() {
+    assert_whole(&[Budget { node: Some(STATELESS), alternates: true, ..KILLS }]);
 }
 
 #[test]
@@ -1193,7 +1199,7 @@ fn saved_by(at: &mut At<'_>, model: u64, seq: u64, n_samples: u64) -> Vec<u8> {
     (book.inputs[0].last, book.inputs[0].counted) = (Some(key), Some(key));
     let sent = book.save(at, Yields::ToOthers, |bytes| engine.worker.state(bytes));
     assert_eq!(sent.expect("saved"), Sent::Yes);
-    at.world.saved.take().expect("a state")
+    at.world.saved[STATEFUL].take().expect("a state")
 }
 
 #[test]
@@ -1216,13 +1222,13 @@ fn a_stage_whose_replacement_fails_goes_on_with_what_it_has_learned() {
     ] {
         let mut engine = at.standby(1);
         if was_active {
-            at.world.saved = Some(own.clone());
+            at.world.saved[STATEFUL] = Some(own.clone());
             at.world.slots.answered[STATEFUL] = None;
             engine.take_over(&mut at, true).expect("active");
             engine.hand_over(&mut at);
         }
         at.world.slots.answered[STATEFUL] = None;
-        at.world.saved = found.cloned();
+        at.world.saved[STATEFUL] = found.cloned();
         engine.take_over(&mut at, false).expect("active again");
         assert_eq!((engine.next_seq().map(|seq| seq - 1), engine.worker.n_samples), expected);
         // A second failure does not lose it.
@@ -1275,7 +1281,7 @@ fn a_saved_state_is_old_if_another_operator_has_answered_samples_since() {
     let saved = saved_by(&mut at, 1, 7, 304);
     for (answered, n_samples) in [(6, 304), (7, 304), (8, 0)] {
         at.world.slots.answered[STATEFUL] = Some(id(3, answered));
-        at.world.saved = Some(saved.clone());
+        at.world.saved[STATEFUL] = Some(saved.clone());
         assert_eq!(at.standby(1).worker.n_samples, n_samples, "{answered}");
     }
 }
@@ -1287,9 +1293,9 @@ fn a_standby_that_has_missed_samples_looks_on_again() {
     let mut world = search.begin();
     let mut at = At::new(&search, &mut world, STATEFUL);
     let (first, later) = (saved_by(&mut at, 1, 0, 1), saved_by(&mut at, 1, 4, 5));
-    at.world.saved = Some(first);
+    at.world.saved[STATEFUL] = Some(first);
     let mut engine = at.standby(1);
-    at.world.saved = Some(later);
+    at.world.saved[STATEFUL] = Some(later);
     at.process().queues = vec![(0, [5, 6].map(|seq| Sample::new(id(3, seq))).into())];
     at.choice = Choice::Queue(0);
     engine.look_on(&mut at).expect("it looks on");

@@ -78,10 +78,7 @@ impl OutputPort {
         max_items: Option<usize>,
         is_compared: bool,
     ) -> Result<OutputPort, OperatorError> {
-        let publisher = match max_items {
-            Some(max_items) => operator.publisher::<M>(port, max_items)?,
-            None => operator.growing_publisher::<M>(port)?,
-        };
+        let publisher = operator.publisher_for::<M>(port, max_items)?;
         let shadow = if is_compared { Some(operator.shadow::<M>(port, max_items)?) } else { None };
         Ok(OutputPort { publisher: publisher.into_untyped(), shadow })
     }
@@ -121,12 +118,8 @@ impl Site for Ports {
         self.inputs[input].reader().put_back(sample);
     }
 
-    fn take_over(&mut self, input: usize, answered: Option<SampleId>) {
-        self.inputs[input].subscriber.take_over(answered);
-    }
-
-    fn take_over_at(&mut self, input: usize, saved: &Input) {
-        self.inputs[input].subscriber.take_over_at(saved.last, saved.counted, saved.counts);
+    fn take_over(&mut self, input: usize, place: &Input, cursor: Option<SampleId>) {
+        self.inputs[input].subscriber.take_over_at(place.last, place.counted, place.counts, cursor);
     }
 
     fn look_on_from(&mut self, input: usize, last: SampleId) {

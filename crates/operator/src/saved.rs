@@ -15,10 +15,12 @@ use crate::cursors::{STATE_BYTES, SampleId};
 use crate::engine::{Site, Yields};
 use crate::outbox::{Entry, Kept};
 use crate::port::{Sent, sample_id};
-use crate::stage::{STATE_FORMAT, encode_state};
 use crate::wiring::InputCounts;
 use crate::written::Written;
 
+/// Numbers have a fixed size, which costs bytes but hardly any time.
+const FORMAT: bincode::config::Configuration<bincode::config::LittleEndian, bincode::config::Fixint> =
+    bincode::config::standard().with_fixed_int_encoding();
 /// The beginning of what is saved. Sources in Rust save bytes of their own, which do not begin like this.
 const MAGIC: &[u8] = b"bg-node2";
 /// An upper bound of the bytes that are saved for each port besides its answers, and for the rest.
@@ -287,6 +289,11 @@ impl Book {
         Ok(None)
     }
 
+    /// Drops the answers that were saved: they are made again.
+    pub(crate) fn forget_answers(&mut self) {
+        self.outputs.iter_mut().for_each(|output| output.kept = Kept::default());
+    }
+
     fn take_in(&mut self, mut found: Found<'_>, sent: &[Option<Written>]) {
         self.is_done = found.is_done;
         for input in &mut self.inputs {
@@ -343,15 +350,15 @@ fn unix_nanos() -> u64 {
 
 fn encode(inputs: &[Input], outputs: &[Output], is_done: bool, bytes: &mut Vec<u8>) -> anyhow::Result<()> {
     bytes.extend_from_slice(MAGIC);
-    encode_state((inputs.len() as u64, outputs.len() as u64, is_done), &mut *bytes)?;
+    put((inputs.len() as u64, outputs.len() as u64, is_done), bytes)?;
     for input in inputs {
-        encode_state((&*input.name, input.last, input.counts, input.counted), &mut *bytes)?;
+        put((&*input.name, input.last, input.counts, input.counted), bytes)?;
     }
     for output in outputs {
         let kept = output.kept.entries();
-        encode_state((&*output.name, output.last, kept.len() as u64), &mut *bytes)?;
+        put((&*output.name, output.last, kept.len() as u64), bytes)?;
         for entry in kept {
-            encode_state((entry.n_head_bytes as u64, entry.bytes.len() as u64), &mut *bytes)?;
+            put((entry.n_head_bytes as u64, entry.bytes.len() as u64), bytes)?;
             bytes.extend_from_slice(&entry.bytes);
         }
     }
@@ -381,8 +388,15 @@ fn read_whole(bytes: &[u8]) -> Option<Found<'_>> {
     Some(Found { inputs, outputs, is_done, state: rest })
 }
 
-fn take<T: serde::de::DeserializeOwned>(rest: &mut &[u8]) -> Option<T> {
-    let (value, n_bytes) = bincode::serde::decode_from_slice(rest, STATE_FORMAT).ok()?;
+/// Adds a value to `bytes`.
+pub(crate) fn put(value: impl serde::Serialize, bytes: &mut Vec<u8>) -> anyhow::Result<()> {
+    bincode::serde::encode_into_std_write(value, bytes, FORMAT)?;
+    Ok(())
+}
+
+/// Takes the value with which `rest` begins.
+pub(crate) fn take<T: serde::de::DeserializeOwned>(rest: &mut &[u8]) -> Option<T> {
+    let (value, n_bytes) = bincode::serde::decode_from_slice(rest, FORMAT).ok()?;
     *rest = &rest[n_bytes..];
     Some(value)
 }

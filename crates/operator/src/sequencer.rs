@@ -709,6 +709,20 @@ mod tests {
         }
     }
 
+    /// A sample that waits is copied, so that its publisher gets its own back.
+    #[test]
+    fn a_held_sample_is_kept_in_another_form_at_its_place() {
+        let id = |seq| SampleId { epoch: EPOCH, seq };
+        let mut sequencer = Sequencer::resume(None, None, InputCounts::default());
+        for seq in [2, 1] {
+            assert_eq!(sequencer.push(seq, id(seq), seq.into(), None, || true, Instant::now), Placing::Hold);
+            sequencer.keep_as(id(seq), |seq| 10 * seq);
+        }
+        sequencer.keep_as(SampleId { epoch: EPOCH + 1, seq: 1 }, |_| 0);
+        assert_eq!(sequencer.push(0, id(0), 3, None, || true, Instant::now), Placing::Deliver(0));
+        assert_eq!([sequencer.next_in_order(), sequencer.next_in_order()], [Some(10), Some(20)]);
+    }
+
     #[test]
     fn where_gaps_are_usual_nothing_waits() {
         let mut sequencer = Sequencer::resume(None, None, InputCounts::default()).without_waiting();

@@ -8,25 +8,40 @@ use std::collections::BTreeMap;
 use blindgrasp_messages::zerocopy::{FromBytes as _, IntoBytes as _};
 use blindgrasp_messages::{Header, Message};
 use serde::Serialize;
+use serde::de::DeserializeOwned;
 use serde_json::{Map, Value};
 
 use crate::engine::{Answer, Hearing, Manner, Taken, Worker};
 use crate::operator::Operator;
 use crate::port::UntypedSample;
 use crate::runner::{self, InputPort, OutputPort, Ports};
-use crate::saved::{Book, Input, Numbers, Output};
+use crate::saved::{self, Book, Input, Numbers, Output};
 
-/// The format of states: numbers of fixed size, which cost bytes but hardly any time.
-pub const STATE_FORMAT: bincode::config::Configuration<bincode::config::LittleEndian, bincode::config::Fixint> =
-    bincode::config::standard().with_fixed_int_encoding();
-
-/// Adds a value to `bytes` in the format of states.
+/// Adds a state to `bytes`, after the name of its format: that of its operator.
 ///
 /// # Errors
-/// The value cannot be encoded.
-pub fn encode_state(value: impl Serialize, bytes: &mut Vec<u8>) -> anyhow::Result<()> {
-    bincode::serde::encode_into_std_write(value, bytes, STATE_FORMAT)?;
-    Ok(())
+/// The state cannot be encoded.
+pub fn encode_state(format: &str, state: impl Serialize, bytes: &mut Vec<u8>) -> anyhow::Result<()> {
+    bytes.extend_from_slice(format.as_bytes());
+    saved::put(state, bytes)
+}
+
+/// A state that [`encode_state`] has encoded.
+///
+/// # Errors
+/// It has another format.
+pub fn decode_state<T: DeserializeOwned>(format: &str, bytes: &[u8]) -> anyhow::Result<T> {
+    if let Some(mut rest) = bytes.strip_prefix(format.as_bytes())
+        && let Some(state) = saved::take(&mut rest)
+        && rest.is_empty()
+    {
+        return Ok(state);
+    }
+    let beginning = String::from_utf8_lossy(&bytes[..bytes.len().min(24)]);
+    anyhow::bail!(
+        "the node's saved state begins with {beginning:?}, expected one that '{format}' of this version has saved: swap to the \
+         operator that has saved it, or start the graph anew"
+    )
 }
 
 /// The work of an operator on samples.
@@ -276,5 +291,23 @@ impl<S: Stage> Worker<UntypedSample> for StageWorker<S> {
     fn look(&mut self) -> anyhow::Result<()> {
         self.stage.look();
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_state_of_another_format_is_refused_in_words() {
+        let mut bytes = Vec::new();
+        encode_state("contacts", (7_u64, "grasp"), &mut bytes).expect("encoded");
+        assert_eq!(decode_state::<(u64, String)>("contacts", &bytes).expect("decoded"), (7, "grasp".into()));
+        for (format, bytes) in [("lift_arbiter", &bytes[..]), ("contacts", &bytes[..20]), ("contacts", b"[7]")] {
+            let refusal = decode_state::<(u64, String)>(format, bytes).expect_err("refused").to_string();
+            assert!(refusal.contains(format!("expected one that '{format}' of this version").as_str()), "{refusal}");
+        }
+        // A part of it would be a number by luck.
+        assert!(decode_state::<u64>("contacts", &bytes).is_err());
     }
 }

@@ -130,6 +130,7 @@ mod tests {
         assert_eq!(written.behind(Some(id(2, 5)), None), None);
         // A reader of an epoch that nobody remembers is behind all others.
         assert!(written.is_past(id(9, 0), id(4, 8)) && !written.is_past(id(4, 8), id(9, 0)));
+        assert!(written.is_past(id(4, 8), id(4, 8)) && written.knows(2) && written.knows(9) && !written.knows(4));
         assert!(written.is_past(id(4, 8), id(4, 7)) && !written.is_past(id(4, 8), id(3, 7)));
     }
 

@@ -24,7 +24,7 @@ use blindgrasp_operator::operator::{Operator, TICK, parse_params};
 use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::port::{Publisher, Sent, Subscriber, sample_id};
 use blindgrasp_operator::source::{self, Source, Step, send};
-use blindgrasp_operator::stage::STATE_FORMAT;
+use blindgrasp_operator::stage::{decode_state, encode_state};
 use blindgrasp_operator::wiring::InputCounts;
 use blindgrasp_operators::beginning::FileNode;
 use blindgrasp_simulator::trial::course::{Course, Finished};
@@ -217,10 +217,7 @@ struct SimulatedHand<'a> {
 impl Source for SimulatedHand<'_> {
     fn resume(&mut self, is_handed_over: bool) -> anyhow::Result<bool> {
         let saved: Saved = match self.operator.saved_state() {
-            Some(bytes) => {
-                let decoded = bincode::serde::decode_from_slice(&bytes, STATE_FORMAT);
-                decoded.context("the node's saved state cannot be read")?.0
-            }
+            Some(bytes) => decode_state("simulated_hand", &bytes)?,
             None => Saved::default(),
         };
         self.decisions.resume(saved.last_decision, saved.counts);
@@ -351,7 +348,9 @@ impl SimulatedHand<'_> {
             last_decision: self.decisions.last,
             counts: self.decisions.subscriber.counts(),
         };
-        self.operator.save_state(&bincode::serde::encode_to_vec(&saved, STATE_FORMAT)?)?;
+        let mut state = Vec::new();
+        encode_state("simulated_hand", &saved, &mut state)?;
+        self.operator.save_state(&state)?;
         // An instance that takes over asks for whatever the saved state does not include: until now its sender had to keep it.
         self.decisions.commit();
         Ok(())
@@ -370,7 +369,7 @@ impl Inbox {
     fn resume(&mut self, last: Option<SampleId>, counts: InputCounts) {
         self.last = last;
         self.received.clear();
-        self.subscriber.take_over_at(last, last, counts);
+        self.subscriber.take_over_at(last, last, counts, last);
     }
 
     /// Whether something has come. It is not answered before [`Inbox::commit`].

@@ -1,12 +1,10 @@
 //! Ports whose type of message is known by its name alone: samples are bytes here.
 
 use anyhow::Context as _;
-use blindgrasp_messages::zerocopy::IntoBytes as _;
 use blindgrasp_messages::{MESSAGE_TYPES, Message, WithMessage, with_message};
 
 use super::protocol::Part;
 use crate::operator::{Operator, OperatorError};
-use crate::partner::Partner;
 use crate::port::bytes::Layout;
 use crate::runner::{InputPort, OutputPort};
 
@@ -48,19 +46,6 @@ pub(super) fn output_of(outputs: &[HostedOutput], part: &Part) -> anyhow::Result
     Ok(idx)
 }
 
-/// The partner of the sample that is answered just now.
-pub(super) trait PartnerPort {
-    /// The bytes of its head and items; `None` if there is none.
-    fn sample(&self) -> Option<(Vec<u8>, Vec<u8>)>;
-}
-
-impl<M: Message> PartnerPort for Partner<M> {
-    fn sample(&self) -> Option<(Vec<u8>, Vec<u8>)> {
-        let sample = Partner::sample(self)?;
-        Some((sample.head.as_bytes().to_vec(), sample.items.as_bytes().to_vec()))
-    }
-}
-
 /// Opens an input port, with a second reader for a standby.
 ///
 /// # Errors
@@ -72,14 +57,6 @@ pub(super) fn open_input(
     has_onlooker: bool,
 ) -> anyhow::Result<InputPort> {
     opened(type_name, OpenInput { operator, port, has_onlooker })
-}
-
-/// Opens a partner input.
-///
-/// # Errors
-/// As [`open_input`].
-pub(super) fn open_partner(operator: &Operator, port: &str, type_name: &str) -> anyhow::Result<Box<dyn PartnerPort>> {
-    opened(type_name, OpenPartner { operator, port })
 }
 
 /// Opens an output port, for samples of up to `max_items` items if there is a limit. A standby sends to it for comparison.
@@ -113,19 +90,6 @@ impl WithMessage for OpenInput<'_> {
 
     fn with<M: Message>(self) -> Self::Output {
         InputPort::open::<M>(self.operator, self.port, self.has_onlooker)
-    }
-}
-
-struct OpenPartner<'a> {
-    operator: &'a Operator,
-    port: &'a str,
-}
-
-impl WithMessage for OpenPartner<'_> {
-    type Output = Result<Box<dyn PartnerPort>, OperatorError>;
-
-    fn with<M: Message>(self) -> Self::Output {
-        Ok(Box::new(self.operator.partner::<M>(self.port)?))
     }
 }
 

@@ -117,7 +117,7 @@ impl Source for HostedSource {
             let state = self.book.restore(&self.site, true)?;
             self.is_done = self.book.is_done;
             for (idx, input) in self.book.inputs.iter().enumerate() {
-                self.site.take_over_at(idx, input);
+                self.site.take_over(idx, input, input.last);
             }
             if self.ready.has_state {
                 self.state = super::restore(&mut self.child, state.as_deref())?.state;
@@ -125,9 +125,10 @@ impl Source for HostedSource {
             return Ok(true);
         }
         self.is_done = false;
-        for idx in 0..self.inputs.len() {
-            let (last, _) = self.site.place(idx);
-            self.site.take_over(idx, last);
+        for (idx, input) in self.book.inputs.iter_mut().enumerate() {
+            (input.last, input.counts) = self.site.place(idx);
+            input.counted = input.last;
+            self.site.take_over(idx, input, input.last);
         }
         let mut places = Resume::new();
         for output in &self.book.outputs {

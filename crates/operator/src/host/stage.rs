@@ -4,25 +4,28 @@
 //! nothing, and after a restart it answers again what readers may lack. Any other is saved after each sample, with its answers
 //! and the places of all its inputs, before the answers are sent.
 
+use std::cell::RefCell;
 use std::collections::VecDeque;
+use std::rc::Rc;
 
 use blindgrasp_messages::Header;
 use serde_json::{Map, Value};
 
 use super::child::Program;
-use super::ports::{self, HostedOutput, PartnerPort, output_of};
+use super::ports::{self, HostedOutput, output_of};
 use super::protocol::{Ask, Hears, MORE, Part, Ready, Work};
 use super::{child, listen, log};
 use crate::description::OperatorDescription;
 use crate::engine::{Answer, Hearing, Manner, Taken, Worker, header_of, with_header};
 use crate::monotonic_nanos;
 use crate::operator::Operator;
+use crate::partner::{self, PartnerInput};
 use crate::port::UntypedSample;
 use crate::runner::{self, InputPort, OutputPort, Ports};
 use crate::saved::{Book, Input, Numbers, Output};
 
 /// A partner input, and its number in the description.
-type NumberedPartner = (usize, Box<dyn PartnerPort>);
+type NumberedPartner = (usize, Rc<RefCell<PartnerInput>>);
 
 /// The open ports of a program.
 pub(super) struct HostedPorts {
@@ -120,12 +123,13 @@ impl HostedPorts {
             if !operator.has_input(&port.name) {
                 continue;
             }
+            let has_onlooker = is_standby && !port.feedback;
+            let opened = ports::open_input(operator, &port.name, &port.type_name, has_onlooker)?;
             if port.partner {
-                partners.push((idx, ports::open_partner(operator, &port.name, &port.type_name)?));
+                partners.push((idx, operator.add_partner(&port.name, opened)?));
                 continue;
             }
-            let has_onlooker = is_standby && !port.feedback;
-            input_ports.push(ports::open_input(operator, &port.name, &port.type_name, has_onlooker)?);
+            input_ports.push(opened);
             input_places.push(Input::new(&port.name, port.feedback));
             inputs.push(idx);
         }
@@ -166,14 +170,17 @@ impl ProgramWorker {
     fn send(&mut self, input: usize, taken: &Taken<UntypedSample>, flags: u32) -> anyhow::Result<()> {
         let mut partners = Vec::new();
         for (port, partner) in &self.partners {
-            if let Some((head, items)) = partner.sample() {
-                partners.push((*port, head, items));
+            if let Some(sample) = partner::chosen(partner) {
+                partners.push((*port, sample));
             }
         }
         let (head, items) = taken.sample.parts();
         let head = with_header(head.to_vec(), &taken.header);
         let own = std::iter::once((self.inputs[input], &head[..], items));
-        let others = partners.iter().map(|(port, head, items)| (*port, &head[..], &items[..]));
+        let others = partners.iter().map(|(port, sample)| {
+            let (head, items) = sample.parts();
+            (*port, head, items)
+        });
         Ok(self.child.ask(Ask::Sample, taken.arrival_nanos, flags, &[], own.chain(others))?)
     }
 

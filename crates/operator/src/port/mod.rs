@@ -64,7 +64,7 @@ pub fn sample_id(header: &Header) -> SampleId {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use std::os::unix::fs::PermissionsExt;
     use std::sync::Arc;
     use std::time::Duration;
@@ -95,7 +95,9 @@ mod tests {
     }
 
     /// Both ends of an edge in one process, and its cursors.
-    fn edge(folder: &std::path::Path) -> (Publisher<LiftDecision>, Subscriber<LiftDecision>, Arc<SharedCursors>) {
+    pub(crate) fn edge(
+        folder: &std::path::Path,
+    ) -> (Publisher<LiftDecision>, Subscriber<LiftDecision>, Arc<SharedCursors>, InputWiring) {
         std::fs::set_permissions(folder, std::fs::Permissions::from_mode(0o700)).expect("its own");
         let domain = NamespaceWiring { folder: folder.into() };
         std::fs::create_dir_all(domain.ports()).expect("a folder");
@@ -128,9 +130,9 @@ mod tests {
             slot: Some(INPUT),
             writer_slot: OUTPUT,
         };
-        let publisher = Publisher::open(&node, &cursors, &output, 0).expect("opened");
+        let publisher = Publisher::open(&node, &cursors, &output, Some(0)).expect("opened");
         let subscriber = Subscriber::open(&node, Some(&cursors), &input).expect("opened");
-        (publisher, subscriber, cursors)
+        (publisher, subscriber, cursors, input)
     }
 
     fn head(seq: u64) -> <LiftDecision as Message>::Head {
@@ -141,7 +143,7 @@ mod tests {
     #[test]
     fn a_publisher_gives_way_to_its_own_reader_and_the_cursor_follows_the_saved_state() {
         let folder = tempfile::tempdir().expect("a folder");
-        let (mut publisher, mut subscriber, cursors) = edge(folder.path());
+        let (mut publisher, mut subscriber, cursors, _) = edge(folder.path());
         let key = |seq| Some(SampleId { epoch: 7, seq });
         publisher.begin(false);
         subscriber.take_over(None);
@@ -170,7 +172,7 @@ mod tests {
         subscriber.commit(&Header { seq: 0, epoch: 7, ..Header::default() });
         assert_eq!(cursors.input(INPUT).key(), key(1));
         let counts = InputCounts { n_received: 1, ..InputCounts::default() };
-        subscriber.take_over_at(key(0), key(0), counts);
+        subscriber.take_over_at(key(0), key(0), counts, key(0));
         assert_eq!((cursors.input(INPUT).key(), cursors.input(INPUT).counts()), (key(0), counts));
         assert_eq!(publisher.begin(false), key(1), "its own samples lie in its memory");
     }

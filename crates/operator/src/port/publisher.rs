@@ -64,13 +64,10 @@ struct Room {
 }
 
 impl Room {
-    fn of<M: Message>(max_items: usize) -> Room {
-        Room { layout: Layout::of::<M>(), n_items: max_items, strategy: AllocationStrategy::Static }
-    }
-
-    /// A larger message takes more memory.
-    fn growing<M: Message>() -> Room {
-        Room { strategy: AllocationStrategy::PowerOfTwo, ..Room::of::<M>(N_FIRST_ITEMS) }
+    /// Without a limit of items, a larger message takes more memory.
+    fn of<M: Message>(max_items: Option<usize>) -> Room {
+        let strategy = if max_items.is_some() { AllocationStrategy::Static } else { AllocationStrategy::PowerOfTwo };
+        Room { layout: Layout::of::<M>(), n_items: max_items.unwrap_or(N_FIRST_ITEMS), strategy }
     }
 }
 
@@ -159,7 +156,8 @@ impl<M: Message> DerefMut for Publisher<M> {
 }
 
 impl<M: Message> Publisher<M> {
-    /// Opens the port, for messages of up to `max_items` items.
+    /// Opens the port, for messages of up to `max_items` items. If their largest number is unknown, a larger message takes more
+    /// memory.
     ///
     /// # Errors
     /// An error of iceoryx2.
@@ -167,22 +165,9 @@ impl<M: Message> Publisher<M> {
         node: &Node<PrivateService>,
         cursors: &Arc<SharedCursors>,
         wiring: &OutputWiring,
-        max_items: usize,
+        max_items: Option<usize>,
     ) -> Result<Self, PortError> {
         let port = UntypedPublisher::open(node, cursors, wiring, &Room::of::<M>(max_items))?;
-        Ok(Publisher { port, message: PhantomData })
-    }
-
-    /// As [`Publisher::open`], for messages whose largest number of items is unknown: a larger message takes more memory.
-    ///
-    /// # Errors
-    /// An error of iceoryx2.
-    pub fn open_growing(
-        node: &Node<PrivateService>,
-        cursors: &Arc<SharedCursors>,
-        wiring: &OutputWiring,
-    ) -> Result<Self, PortError> {
-        let port = UntypedPublisher::open(node, cursors, wiring, &Room::growing::<M>())?;
         Ok(Publisher { port, message: PhantomData })
     }
 
@@ -214,7 +199,6 @@ impl<M: Message> Publisher<M> {
 /// The sending end of an edge, whatever its message.
 pub struct UntypedPublisher {
     sender: Sender,
-    cursors: Arc<SharedCursors>,
     slot: usize,
     credit: Credit,
     wait_limit: Duration,
@@ -237,7 +221,6 @@ impl UntypedPublisher {
     ) -> Result<Self, PortError> {
         Ok(UntypedPublisher {
             sender: Sender::open(node, cursors, &wiring.bells, &wiring.service, room)?,
-            cursors: Arc::clone(cursors),
             slot: wiring.slot,
             credit: Credit::new(&wiring.consumers, wiring.service.history),
             wait_limit: Duration::from_millis(wiring.wait_limit_millis),
@@ -261,7 +244,7 @@ impl UntypedPublisher {
     }
 
     fn slot(&self) -> &OutputSlot {
-        self.cursors.output(self.slot)
+        self.sender.cursors.output(self.slot)
     }
 
     /// Names the readers in this process, by their slots: the publisher gives way at once if one of them has no room.
@@ -280,7 +263,7 @@ impl UntypedPublisher {
     pub fn begin(&mut self, is_handed_over: bool) -> Option<SampleId> {
         let written = self.written();
         self.waits_since = None;
-        let known = self.credit.begin(is_handed_over, &*self.cursors, written);
+        let known = self.credit.begin(is_handed_over, &*self.sender.cursors, written);
         self.has_sent_all.store(self.credit.has_sent_all(written), Ordering::Relaxed);
         known
     }
@@ -288,12 +271,12 @@ impl UntypedPublisher {
     /// The last sample that every lossless reader, and those behind it, have answered; `None` if there is none, or no such
     /// reader.
     pub fn answered_by_readers(&self) -> Option<SampleId> {
-        self.credit.answered_by_readers(&*self.cursors, self.written())
+        self.credit.answered_by_readers(&*self.sender.cursors, self.written())
     }
 
     /// Whether there is a reader that the publisher waits for.
     pub fn has_readers(&self) -> bool {
-        self.credit.has_readers(&*self.cursors)
+        self.credit.has_readers(&*self.sender.cursors)
     }
 
     /// How far the instances of the node have come.
@@ -345,7 +328,7 @@ impl UntypedPublisher {
     pub fn look_for_readers(&mut self) -> Result<(), PortError> {
         self.sender.look_for_readers()?;
         let n_publishers = self.sender.pub_sub.dynamic_config().number_of_publishers();
-        match self.credit.lost_predecessor(&*self.cursors, self.written(), n_publishers) {
+        match self.credit.lost_predecessor(&*self.sender.cursors, self.written(), n_publishers) {
             Some(SampleId { seq, .. }) => Err(PortError::PredecessorGone { service: self.sender.service.clone(), seq }),
             None => Ok(()),
         }
@@ -369,15 +352,15 @@ impl UntypedPublisher {
 
     fn has_room(&mut self, key: SampleId) -> bool {
         let written = self.written();
-        self.credit.first_without_room(&*self.cursors, written, key).is_none()
+        self.credit.first_without_room(&*self.sender.cursors, written, key).is_none()
     }
 
     /// Gives up the attached readers that have had no room for a sample for longer than their time, with all their readers:
     /// the other ports need not wait for them as well.
     fn give_up_attached(&mut self, key: SampleId, waited: Duration) {
-        let (cursors, written) = (Arc::clone(&self.cursors), self.written());
-        while let Some(reader) = self.credit.first_without_room(&*cursors, written, key) {
-            if !gives_up(reader, waited, &cursors) {
+        let written = self.written();
+        while let Some(reader) = self.credit.first_without_room(&*self.sender.cursors, written, key) {
+            if !gives_up(reader, waited, &self.sender.cursors) {
                 return;
             }
         }
@@ -388,7 +371,7 @@ impl UntypedPublisher {
         if waited > START_HOLD_LIMIT.min(self.wait_limit / 2) {
             let n_publishers = self.sender.pub_sub.dynamic_config().number_of_publishers();
             let written = self.written();
-            self.credit.has_waited_long(&*self.cursors, written, n_publishers);
+            self.credit.has_waited_long(&*self.sender.cursors, written, n_publishers);
         }
     }
 
@@ -419,7 +402,7 @@ impl UntypedPublisher {
             publisher.give_up_attached(key, waited);
             let written = publisher.written();
             let own_readers = &publisher.own_readers;
-            if publisher.credit.waits_for_one_of(own_readers, &*publisher.cursors, written, key) {
+            if publisher.credit.waits_for_one_of(own_readers, &*publisher.sender.cursors, written, key) {
                 return Wait::InVain;
             }
             Wait::On
@@ -437,7 +420,7 @@ impl UntypedPublisher {
         should_yield: &mut dyn FnMut() -> bool,
     ) -> Result<Sent, PortError> {
         self.wait(key, should_yield, |publisher, waited| {
-            let behind = publisher.credit.readers_that_lack(key, &*publisher.cursors, publisher.written());
+            let behind = publisher.credit.readers_that_lack(key, &*publisher.sender.cursors, publisher.written());
             if behind.is_empty() {
                 return Wait::Over;
             }
@@ -446,7 +429,7 @@ impl UntypedPublisher {
             }
             if behind.iter().all(|reader| !reader.attached_slots.is_empty()) {
                 for reader in behind {
-                    gives_up(reader, waited, &publisher.cursors);
+                    gives_up(reader, waited, &publisher.sender.cursors);
                 }
             }
             Wait::On
@@ -520,7 +503,7 @@ fn gives_up(reader: &Reader, waited: Duration, cursors: &SharedCursors) -> bool 
 pub(crate) struct ShadowPublisher(Sender);
 
 impl ShadowPublisher {
-    /// Opens the port, as [`Publisher::open`] or, without a limit of items, [`Publisher::open_growing`].
+    /// Opens the port, as [`Publisher::open`].
     ///
     /// # Errors
     /// An error of iceoryx2.
@@ -530,8 +513,8 @@ impl ShadowPublisher {
         wiring: &OutputWiring,
         max_items: Option<usize>,
     ) -> Result<Self, PortError> {
-        let room = max_items.map_or_else(Room::growing::<M>, Room::of::<M>);
-        Ok(ShadowPublisher(Sender::open(node, cursors, &[COMPARE_BELL], &wiring.shadow, &room)?))
+        let sender = Sender::open(node, cursors, &[COMPARE_BELL], &wiring.shadow, &Room::of::<M>(max_items))?;
+        Ok(ShadowPublisher(sender))
     }
 
     /// Sends a sample to the readers that are there.

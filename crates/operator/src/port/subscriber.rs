@@ -203,10 +203,17 @@ impl UntypedSubscriber {
         }
     }
 
-    /// Goes on after `last`, the last sample that a saved state includes, with counts that include the samples up to `counted`.
-    pub fn take_over_at(&mut self, last: Option<SampleId>, counted: Option<SampleId>, counts: InputCounts) {
+    /// Goes on after `last`, with counts that include the samples up to `counted`. The cursor is put at `cursor`: the last sample
+    /// that a saved state includes, or the last one that is counted.
+    pub fn take_over_at(
+        &mut self,
+        last: Option<SampleId>,
+        counted: Option<SampleId>,
+        counts: InputCounts,
+        cursor: Option<SampleId>,
+    ) {
         if let Some((cursors, slot)) = &self.cursors {
-            cursors.input(*slot).place_at(last, &counts);
+            cursors.input(*slot).place_at(cursor, &counts);
             self.begin_with(Sequencer::resume(last, counted, counts));
         }
     }

@@ -70,7 +70,7 @@ impl Downlink {
     /// # Errors
     /// The wiring does not have this port, or iceoryx2 fails.
     pub(super) fn open<M: Message>(operator: &Operator, channel: &Channel, instance: u64) -> anyhow::Result<Downlink> {
-        let mut publisher = operator.growing_publisher::<M>(&channel.port)?;
+        let mut publisher = operator.publisher_for::<M>(&channel.port, None)?;
         // Samples that an earlier process published and that have no answer may have been lost with that process.
         let incoming = Incoming::new(channel.policy, instance, publisher.begin(false));
         Ok(Downlink {
