@@ -91,16 +91,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         print_line("this shard has no recordings")?;
         return Ok(Outcome::Done);
     }
-    if let Some(junit) = &arguments.junit {
-        let expectations = recordings.iter().map(|recording| expectations::path_of(recording));
-        check_output(junit, &recordings.iter().cloned().chain(expectations).collect::<Vec<_>>())?;
-        if junit.is_file() && junit.extension().is_none_or(|extension| extension != "xml") {
-            anyhow::bail!("{} (--junit): the file exists, and only a file .xml is replaced", junit.display());
-        }
-    }
-    if let Some(summary) = &arguments.summary {
-        check_output(summary, &recordings)?;
-    }
+    check_outputs(arguments, &recordings)?;
     let n_stops = stop_requests()?;
     let runner = Runner {
         dataflow: &arguments.dataflow,
@@ -141,6 +132,21 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         0 => printed.map(|()| Outcome::Done),
         n_failed => bail!("{n_failed} of {} recordings failed", cases.len()),
     }
+}
+
+/// Refuses files to write that are read as well, and a file of another kind.
+fn check_outputs(arguments: &Arguments, recordings: &[PathBuf]) -> anyhow::Result<()> {
+    if let Some(junit) = &arguments.junit {
+        let expectations = recordings.iter().map(|recording| expectations::path_of(recording));
+        check_output(junit, &recordings.iter().cloned().chain(expectations).collect::<Vec<_>>())?;
+        if junit.is_file() && junit.extension().is_none_or(|extension| extension != "xml") {
+            bail!("{} (--junit): the file exists, and only a file .xml is replaced", junit.display());
+        }
+    }
+    if let Some(summary) = &arguments.summary {
+        check_output(summary, recordings)?;
+    }
+    Ok(())
 }
 
 impl Runner<'_> {

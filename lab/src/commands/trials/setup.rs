@@ -41,6 +41,20 @@ pub(super) struct Setup {
     pub(super) probe: Option<ProbeMove>,
 }
 
+/// The params of the node that tries, which say what is tried.
+fn course_params(arguments: &Arguments, node: &str) -> Vec<Override> {
+    let mut params = vec![
+        set(node, "things", arguments.objects.clone()),
+        set(node, "trials", arguments.trials.to_string()),
+        set(node, "attempts", arguments.attempts.to_string()),
+        set(node, "seed", arguments.seed.to_string()),
+    ];
+    if let Some(Shard { idx, n }) = arguments.shard {
+        params.push(set(node, "shard", format!("{idx}/{n}")));
+    }
+    params
+}
+
 impl Setup {
     /// Reads the file and finds the node whose outcomes are counted.
     pub(super) fn new(arguments: &Arguments) -> anyhow::Result<Setup> {
@@ -68,17 +82,7 @@ impl Setup {
         if let Some(set) = overrides.iter().find(|set| set.is_of(&node.id) && own_option(&set.param).is_some()) {
             bail!("--set {set}: use {} instead", own_option(&set.param).unwrap_or_default());
         }
-        for (param, text) in [
-            ("things", arguments.objects.clone()),
-            ("trials", arguments.trials.to_string()),
-            ("attempts", arguments.attempts.to_string()),
-            ("seed", arguments.seed.to_string()),
-        ] {
-            overrides.push(set(&node.id, param, text));
-        }
-        if let Some(Shard { idx, n }) = arguments.shard {
-            overrides.push(set(&node.id, "shard", format!("{idx}/{n}")));
-        }
+        overrides.extend(course_params(arguments, &node.id));
         let mut model = text_param(&graph, "model").unwrap_or_default();
         if let Some(path) = &arguments.model {
             let path = path.to_str().context("--model: the path is not UTF-8")?;
