@@ -31,7 +31,6 @@ mod source;
 mod split;
 mod summary;
 mod types;
-mod value;
 mod viewer;
 mod writer;
 
@@ -53,7 +52,6 @@ pub use parts::{Manifest, part_path, recordings_in};
 pub use problems::{Oddity, Problem, Problems};
 pub use reader::RecordingReader;
 pub use repair::{RepairReport, repair, repaired_path};
-pub use value::{Value, ValueError, leaves};
 pub use viewer::{LinkPose, ShownHand, TOPICS_FOR_VIEWERS};
 pub use writer::RecordingWriter;
 

@@ -108,11 +108,9 @@ impl LiveFile {
             let n_bytes: usize = metadata.iter().map(|(key, value)| key.len() + value.len() + 8).sum();
             live.n_definition_bytes += (n_bytes + 2 * name.len() + 64) as u64;
         }
-        let mut n_attached_bytes = 0;
-        for (name, data) in attachments {
-            live.n_definition_bytes += (2 * name.len() + 256) as u64;
-            n_attached_bytes += data.len() as u64;
-        }
+        // Each has an entry in the summary.
+        live.n_definition_bytes += 256 * attachments.len() as u64;
+        let n_attached_bytes: u64 = attachments.iter().map(|(_, data)| data.len() as u64).sum();
         let begun = live.reserve(CHUNK_BYTES + n_attached_bytes).and_then(|()| {
             for (name, metadata) in metadata {
                 let metadata = Metadata { name: (*name).into(), metadata: (*metadata).clone() };

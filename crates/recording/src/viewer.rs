@@ -365,11 +365,9 @@ mod tests {
         let found: Vec<_> = messages.iter().map(|(standard, data)| (standard.topic, hex(data))).collect();
         assert_eq!(found[0], ("/robot_description", "00010000090000003c726f626f742f3e00".into()));
         assert_eq!(found[1].0, "/joint_states");
-        let expected = "000100000100000005000000070000000500000070616c6d00000000040000007469700000000000000000000000e03f\
-             000000000000000000000000000000400000000000000000000000000000000000000000000000000000000000000000\
-             000000000000f03f";
-        let expected: String = expected.split_whitespace().collect();
-        assert_eq!(found[2], ("/tf", expected));
+        let expected = "000100000100000005000000070000000500000070616c6d000000000400000074697000000000000000e03f00000000\
+             000000000000000000000040000000000000000000000000000000000000000000000000000000000000f03f";
+        assert_eq!(found[2], ("/tf", expected.into()));
         let of_next = viewer.of_frame("/tactile", &frame, false).expect("messages");
         assert_eq!(of_next.len(), 2);
         assert!(viewer.of_frame("/other", &frame, true).expect("messages").is_empty());

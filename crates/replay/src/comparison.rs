@@ -8,11 +8,12 @@ use std::fmt;
 use std::path::Path;
 
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
 
 use super::played::is_played;
 use blindgrasp_messages::{Header, with_sample};
 use blindgrasp_recording::cdr;
-use blindgrasp_recording::{ChosenSamples, Reach, Record, RecordingError, RecordingReader, Value, ValueError, leaves};
+use blindgrasp_recording::{ChosenSamples, Reach, Record, RecordingError, RecordingReader};
 
 /// A sample counts as re-ordered if it is at most so many samples away in the other recording.
 const WINDOW: usize = 512;
@@ -102,8 +103,6 @@ pub enum What {
 pub enum CompareError {
     #[error(transparent)]
     Recording(#[from] RecordingError),
-    #[error(transparent)]
-    Value(#[from] ValueError),
     #[error("a message cannot be encoded: {0}")]
     Encode(String),
     #[error("recording {path}: it holds no {topic}")]
@@ -417,31 +416,66 @@ fn first_difference(recorded: &Sample, found: &Sample, tolerance: Tolerance) -> 
     // A list may be longer in the replay.
     let expected_at: HashSet<&str> = was.iter().map(|(path, _)| path.as_str()).collect();
     let extra = is.iter().find(|(path, _)| !expected_at.contains(path.as_str()));
-    Ok(extra.map(|(path, found)| different(path, None, Some(found))))
+    if let Some((path, found)) = extra {
+        return Ok(Some(different(path, None, Some(found))));
+    }
+    if tolerance.absolute == 0.0 && tolerance.relative == 0.0 {
+        // JSON has null for both.
+        return Ok(Some(different("NaN or infinity", None, None)));
+    }
+    Ok(None)
+}
+
+/// All numbers, flags and texts of a message as JSON has them, with their paths, like `contacts[2].position_m[0]`. A number
+/// that is not finite is null.
+fn leaves(record: &Record) -> Result<Vec<(String, Value)>, CompareError> {
+    let message = record.to_json().map_err(|error| CompareError::Encode(error.to_string()))?;
+    let mut found = Vec::new();
+    add_leaves(String::new(), message, &mut found);
+    Ok(found)
+}
+
+fn add_leaves(path: String, value: Value, found: &mut Vec<(String, Value)>) {
+    match value {
+        Value::Array(items) => {
+            for (idx, item) in items.into_iter().enumerate() {
+                add_leaves(format!("{path}[{idx}]"), item, found);
+            }
+        }
+        Value::Object(fields) => {
+            let before = if path.is_empty() { path } else { path + "." };
+            for (name, value) in fields {
+                add_leaves(format!("{before}{name}"), value, found);
+            }
+        }
+        leaf => found.push((path, leaf)),
+    }
 }
 
 fn different(path: &str, expected: Option<&Value>, found: Option<&Value>) -> What {
-    let difference = match (expected, found) {
-        (Some(Value::Float(was)), Some(Value::Float(is))) => Some(format!("{:e}", is - was)),
-        (Some(Value::Unsigned(was)), Some(Value::Unsigned(is))) => {
-            Some((i128::from(*is) - i128::from(*was)).to_string())
-        }
-        (Some(Value::Signed(was)), Some(Value::Signed(is))) => Some((i128::from(*is) - i128::from(*was)).to_string()),
-        _ => None,
+    let mut difference = None;
+    if let (Some(Value::Number(was)), Some(Value::Number(is))) = (expected, found) {
+        difference = match (was.as_i128(), is.as_i128()) {
+            (Some(was), Some(is)) => Some((is - was).to_string()),
+            _ => was.as_f64().zip(is.as_f64()).map(|(was, is)| format!("{:e}", is - was)),
+        };
+    }
+    let text = |leaf: &Value| match leaf {
+        Value::String(text) => text.clone(),
+        Value::Null => "NaN or infinity".into(),
+        leaf => leaf.to_string(),
     };
-    let text = |leaf: Option<&Value>| leaf.map(Value::to_string);
-    What::Field { path: path.into(), expected: text(expected), found: text(found), difference }
+    What::Field { path: path.into(), expected: expected.map(text), found: found.map(text), difference }
 }
 
 fn are_equal(expected: &Value, found: &Value, tolerance: Tolerance) -> bool {
-    match (expected, found) {
-        (Value::Float(expected), Value::Float(found)) => {
-            let allowed = tolerance.absolute + tolerance.relative * expected.abs();
-            let is_near = allowed > 0.0 && allowed.is_finite() && (found - expected).abs() <= allowed;
-            expected.to_bits() == found.to_bits() || is_near
-        }
-        _ => expected == found,
+    if !expected.is_f64() || !found.is_f64() {
+        return expected == found;
     }
+    let (Some(expected), Some(found)) = (expected.as_f64(), found.as_f64()) else { return false };
+    let allowed = tolerance.absolute + tolerance.relative * expected.abs();
+    let is_near = allowed > 0.0 && allowed.is_finite() && (found - expected).abs() <= allowed;
+    expected.to_bits() == found.to_bits() || is_near
 }
 
 /// The bytes of the message: messages with the same bytes are the same in every bit.
@@ -449,4 +483,54 @@ fn encoded(record: &Record) -> Result<Vec<u8>, CompareError> {
     let mut data = Vec::new();
     with_sample!(record, sample => cdr::encode(&sample.message, &mut data)).map_err(CompareError::Encode)?;
     Ok(data)
+}
+
+#[cfg(test)]
+mod tests {
+    use blindgrasp_messages::{Contact, ContactSet, Fault, Phase, Stamped};
+
+    use super::*;
+
+    fn sample(change: impl FnOnce(&mut ContactSet)) -> Sample {
+        let contacts = vec![Contact::default(); 2];
+        let mut message = ContactSet { grasp_id: 7, phase: Phase::Settled, contacts, ..ContactSet::default() };
+        change(&mut message);
+        let header = Header::default();
+        Sample { header, record: Record::Contacts(Stamped { header, message }) }
+    }
+
+    /// The first difference of a changed sample, as it is shown.
+    fn shown(change: impl FnOnce(&mut ContactSet), tolerance: Tolerance) -> Option<String> {
+        let what = first_difference(&sample(|_| {}), &sample(change), tolerance).expect("compared")?;
+        Some(Difference { grasp_id: 7, seq: 0, what }.to_string())
+    }
+
+    #[test]
+    fn the_first_value_that_differs_is_named() {
+        let exact = Tolerance::default();
+        let near = Tolerance { absolute: 0.1, relative: 0.0 };
+        let move_it = |message: &mut ContactSet| message.contacts[1].position_m[0] = 0.0625;
+        assert_eq!(
+            shown(move_it, exact).as_deref(),
+            Some("grasp 7, seq 0: contacts[1].position_m[0]: expected 0.0, found 0.0625, difference 0.0625")
+        );
+        assert_eq!(shown(move_it, near), None);
+        let says = |found: Option<String>, what: &str| {
+            let found = found.expect("a difference");
+            assert!(found.contains(what), "{found}");
+        };
+        says(shown(|message| message.contacts[1].pad = 3, near), "contacts[1].pad: expected 0, found 3, difference 3");
+        says(shown(|message| message.fault = Fault::NoContact, near), "fault: expected none, found no_contact");
+        says(shown(|message| message.contacts[0].normal[2] = -0.0, exact), "expected 0.0, found -0.0");
+        says(shown(|message| message.contacts[0].normal[2] = f64::NAN, near), "expected 0.0, found NaN or infinity");
+        says(shown(|message| message.contacts.truncate(1), near), "expected 0, found nothing");
+        says(shown(|message| message.contacts.push(Contact::default()), near), "expected nothing, found 0");
+    }
+
+    #[test]
+    fn nan_is_not_infinity() {
+        let of = |number: f64| sample(|message| message.contacts[0].force_newtons = number);
+        let compared = |found| first_difference(&of(f64::NAN), &of(found), Tolerance::default()).expect("compared");
+        assert!(compared(f64::INFINITY).is_some() && compared(f64::NAN).is_none());
+    }
 }

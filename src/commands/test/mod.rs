@@ -17,7 +17,7 @@ use clap::Args;
 use self::case::{Case, Runner};
 use self::scratch::Scratch;
 use self::sweep::Sweep;
-use super::{Outcome, check_output, print_line, stop_requests};
+use super::{Outcome, check_output, stop_requests};
 use blindgrasp_cli::shard::Shard;
 use blindgrasp_graph::dataflow::Override;
 use blindgrasp_operator::diagnostics::print_diagnostic;
@@ -87,10 +87,6 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         named => named.to_vec(),
     };
     let recordings = arguments.shard.of(recordings);
-    if recordings.is_empty() {
-        print_line("this shard has no recordings")?;
-        return Ok(Outcome::Done);
-    }
     check_outputs(arguments, &recordings)?;
     let n_stops = stop_requests()?;
     let runner = Runner {
