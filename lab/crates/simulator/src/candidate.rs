@@ -276,6 +276,7 @@ mod tests {
     use parry3d_f64::math::Vector;
     use parry3d_f64::shape::SharedShape;
     use std::path::Path;
+    use std::sync::LazyLock;
 
     fn barrett() -> Hand {
         Hand::load(Path::new("barrett-bh8-280")).expect("built in")
@@ -291,12 +292,13 @@ mod tests {
         options: &SimulatorOptions,
         n: u64,
     ) -> Vec<(Object, Start, Exploration, Vec<SimulatedContact>)> {
+        // Making them takes longer than closing on a hundred.
+        static OBJECTS: LazyLock<Vec<Object>> = LazyLock::new(|| blindgrasp_objects::select("all").expect("built in"));
         let mechanism = Mechanism::new(hand);
-        let objects = blindgrasp_objects::select("all").expect("built in");
         (0..n)
             .filter_map(|idx| {
                 let mut rng = candidate_rng(7, idx, 0);
-                let object = objects[idx as usize % objects.len()].clone();
+                let object = OBJECTS[idx as usize % OBJECTS.len()].clone();
                 let start = draw_start(hand, &options.protocol, &mut rng);
                 let (exploration, contacts) = grasp(&mechanism, &object, &start, options).expect("a hand")?;
                 Some((object, start, exploration, contacts))
