@@ -49,14 +49,13 @@ fn anchors_and_links_are_found_as_github_does() {
     assert_eq!(links(text), ["a.md", "b.md#c", "g.svg"]);
 }
 
-/// README, ARCHITECTURE, CONTRIBUTING, the benchmarks, all pages of docs, and the README of each folder that has one.
+/// README, ARCHITECTURE, CONTRIBUTING, all pages of docs and benches, and the README of each folder that has one.
 fn pages() -> Vec<PathBuf> {
     let root = project();
     let mut pages: Vec<PathBuf> =
-        ["README.md", "ARCHITECTURE.md", "CONTRIBUTING.md", "benches/archive.md", "benches/benchmarks.md"]
-            .map(|name| root.join(name))
-            .into();
+        ["README.md", "ARCHITECTURE.md", "CONTRIBUTING.md"].map(|name| root.join(name)).into();
     pages.extend(files_below(&root.join("docs"), "md"));
+    pages.extend(files_below(&root.join("benches"), "md"));
     let of_folders = ["hands", "recordings", "examples", "packaging"].map(|folder| root.join(folder).join("README.md"));
     pages.extend(of_folders.into_iter().filter(|page| page.exists()));
     pages

@@ -268,6 +268,7 @@ fn frames(hand: &Hand, grasp: &CandidateGrasp, options: &SimulatorOptions, grasp
 
 #[cfg(test)]
 mod tests {
+    use super::super::wrench_space::STABLE_EPSILON;
     use super::*;
     use blindgrasp_mesh::mass::solid_properties;
     use blindgrasp_stages::hand::pose_from_isometry;
@@ -275,6 +276,7 @@ mod tests {
     use parry3d_f64::math::Vector;
     use parry3d_f64::shape::SharedShape;
     use std::path::Path;
+    use std::sync::LazyLock;
 
     fn barrett() -> Hand {
         Hand::load(Path::new("barrett-bh8-280")).expect("built in")
@@ -290,17 +292,23 @@ mod tests {
         options: &SimulatorOptions,
         n: u64,
     ) -> Vec<(Object, Start, Exploration, Vec<SimulatedContact>)> {
+        // Making them takes longer than closing on a hundred.
+        static OBJECTS: LazyLock<Vec<Object>> = LazyLock::new(|| blindgrasp_objects::select("all").expect("built in"));
         let mechanism = Mechanism::new(hand);
-        let objects = blindgrasp_objects::select("all").expect("built in");
         (0..n)
             .filter_map(|idx| {
                 let mut rng = candidate_rng(7, idx, 0);
-                let object = objects[idx as usize % objects.len()].clone();
+                let object = OBJECTS[idx as usize % OBJECTS.len()].clone();
                 let start = draw_start(hand, &options.protocol, &mut rng);
                 let (exploration, contacts) = grasp(&mechanism, &object, &start, options).expect("a hand")?;
                 Some((object, start, exploration, contacts))
             })
             .collect()
+    }
+
+    /// At friction 1.
+    fn quality_of(object: &Object, exploration: &Exploration, contacts: &[SimulatedContact]) -> Quality {
+        quality(&grasp_case(object, &exploration.palm_from_object, contacts, 1.0)).expect("a hull")
     }
 
     /// The least distance between any link and the object, and between links that closing may bring together.
@@ -404,9 +412,43 @@ mod tests {
         let (exploration, contacts) = grasp(&mechanism, &ball, &start, &options).expect("a hand").expect("touches");
         assert_eq!(contacts.len(), 4, "{contacts:?}");
         assert!((exploration.palm_from_object.translation.vector - Vector3::new(0.0, 0.0, 0.0451)).norm() < 1e-5);
-        let quality =
-            quality(&grasp_case(&ball, &exploration.palm_from_object, &contacts, options.friction)).expect("a hull");
+        let quality = quality_of(&ball, &exploration, &contacts);
         assert!(quality.is_stable(), "{quality:?}");
+    }
+
+    /// Dang & Allen, section IV-B: grasps with an epsilon above 0.07 stand more uncertainty about the object's pose. Here the
+    /// object is moved aside by up to 15 mm and turned by 10 degrees, and the hand comes and closes again.
+    #[test]
+    fn grasps_of_more_epsilon_close_again_on_an_object_that_lies_elsewhere() {
+        let hand = barrett();
+        let options = SimulatorOptions::default();
+        let mechanism = Mechanism::new(&hand);
+        let mut rng = candidate_rng(8, 0, 0);
+        // Of grasps with an epsilon to 0.07, and above.
+        let (mut n_moved, mut n_closed) = ([0_u32; 2], [0_u32; 2]);
+        for (object, start, exploration, contacts) in grasps(&hand, &options, 120) {
+            let before = quality_of(&object, &exploration, &contacts);
+            if !before.force_closure {
+                continue;
+            }
+            let group = usize::from(before.epsilon > STABLE_EPSILON);
+            for _ in 0..2 {
+                let by = draw_start(&hand, &options.protocol, &mut rng);
+                let axis = by.palm_from_object_rotation.axis().expect("a turn");
+                let turn = UnitQuaternion::from_axis_angle(&axis, 10_f64.to_radians());
+                let moved = Start {
+                    palm_from_object_rotation: turn * start.palm_from_object_rotation,
+                    lateral_offset_m: [0, 1].map(|idx| start.lateral_offset_m[idx] + by.lateral_offset_m[idx]),
+                    ..start.clone()
+                };
+                n_moved[group] += 1;
+                if let Some((exploration, contacts)) = grasp(&mechanism, &object, &moved, &options).expect("a hand") {
+                    n_closed[group] += u32::from(quality_of(&object, &exploration, &contacts).force_closure);
+                }
+            }
+        }
+        println!("closed again, epsilon to 0.07 and above: {n_closed:?} of {n_moved:?}");
+        assert!(n_closed[1] * n_moved[0] > n_closed[0] * n_moved[1], "{n_closed:?} of {n_moved:?}");
     }
 
     /// One motor moves the knuckles, the inner knuckles and the fingers of both sides.
@@ -469,8 +511,8 @@ mod tests {
             let [here, there] = [here, there].map(|(object, start)| {
                 let (exploration, contacts) =
                     grasp(&mechanism, &object, &start, &options).expect("a hand").expect("touches");
-                let case = grasp_case(&object, &exploration.palm_from_object, &contacts, options.friction);
-                (exploration.posture(exploration.end), contacts, quality(&case).expect("a hull"))
+                let quality = quality_of(&object, &exploration, &contacts);
+                (exploration.posture(exploration.end), contacts, quality)
             });
             for (a, b) in here.0.iter().zip(&there.0) {
                 assert!((a - b).abs() < 1e-3, "{name}: {:?} {:?}", here.0, there.0);
