@@ -820,8 +820,7 @@ impl<T: Sample, W: Worker<T>> Engine<T, W> {
         let input = &mut self.book.inputs[0];
         if !self.manner.saves {
             input.last = least;
-            // An instance with state, which was before it, may have counted samples that it was to answer again. Only its saved
-            // state said so; from now on the cursor does.
+            // From now on the cursor says which samples are counted, and not the saved state of an instance before.
             site.take_over(0, input, input.counted);
             site.forget_state();
             return Ok(());
@@ -865,11 +864,11 @@ impl<T: Sample, W: Worker<T>> Engine<T, W> {
     /// failed replacement has left no state that the worker can use, the worker goes on with the state with which it handed
     /// over. The places stay those of the replacement.
     fn restore<S: Site<Sample = T>>(&mut self, site: &S) -> anyhow::Result<bool> {
-        let mut saved = self.book.restore(site, false)?;
-        if !self.manner.saves {
-            // Of another instance's saved state, it needs the places alone.
-            self.book.forget_answers();
-            saved = None;
+        let mut saved = None;
+        if self.manner.saves {
+            saved = self.book.restore(site, false)?;
+        } else {
+            self.book.restore_counts(site)?;
         }
         let Some(own) = self.handed_over.take() else {
             self.worker.restore(saved.as_deref())?;

@@ -78,8 +78,8 @@ struct Budget {
     is_live: bool,
     /// The stages have a partner input.
     has_partners: bool,
-    /// The instances of the node without state have none and one in turn.
-    alternates: bool,
+    /// Every second instance of the node without state has one: those with odd or with even numbers.
+    alternates: Option<u8>,
 }
 
 /// A sample on its way. It is `made_by` the process that has decided it.
@@ -943,7 +943,7 @@ impl<'a> At<'a> {
 
     /// A stage that stands by.
     fn standby(&mut self, model: u64) -> Engine<Sample, Counter> {
-        let has_state = self.node == STATEFUL || self.search.budget.alternates && self.process().id % 2 == 1;
+        let has_state = self.node == STATEFUL || self.search.budget.alternates == Some(self.process().id % 2);
         let book = Book::new(vec![Input::new("in", false)], vec![Output::new("out", Numbers::OfWorker)]);
         let worker = Counter { has_state, model, n_samples: 0, last: None, answer: None, is_broken: false };
         let manner = Manner { saves: has_state, answers_each: true, n_batch: 1, has_suspect: false };
@@ -1151,7 +1151,7 @@ const KILLS: Budget = Budget {
     skipped: None,
     is_live: false,
     has_partners: false,
-    alternates: false,
+    alternates: None,
 };
 const SWAP: Budget = Budget { n_kills: 1, n_swaps: 1, ..KILLS };
 const LATE: Budget = Budget { n_kills: 1, n_late: 1, ..KILLS };
@@ -1181,13 +1181,16 @@ fn kills_swaps_and_late_connections_lose_and_repeat_nothing() {
 /// The places of an instance with state are in its saved state, those of one without are the cursors.
 #[test]
 fn instances_with_and_without_state_in_turn_count_each_sample_once() {
-    assert_whole(&[Budget { node: Some(STATELESS), alternates: true, ..KILLS }]);
+    let alternates = |odd| Budget { node: Some(STATELESS), alternates: Some(odd), ..KILLS };
+    assert_whole(&[alternates(1), alternates(0)]);
 }
 
 #[test]
 fn a_sample_that_waits_for_its_partner_is_not_lost() {
-    let partners = |node| Budget { n_kills: 1, node: Some(node), has_partners: true, ..KILLS };
-    assert_whole(&[partners(STATELESS), partners(STATEFUL)]);
+    for node in [STATELESS, STATEFUL] {
+        let kill = Budget { n_kills: 1, node: Some(node), has_partners: true, ..KILLS };
+        assert_whole(&[kill, Budget { n_kills: 0, n_swaps: 1, ..kill }]);
+    }
 }
 
 /// A stage with state in a world of its own, and what an instance of it with that model has saved there.
@@ -1331,6 +1334,9 @@ fn an_old_instance_may_end_with_its_reader_and_an_epoch_may_lack_its_end() {
 #[ignore = "takes minutes: cargo test --release --workspace --lib recovery_model -- --ignored"]
 fn more_kills_and_swaps_of_all_nodes_lose_and_repeat_nothing() {
     let two_kills_and_a_swap = Budget { kills_pairs: false, kills_reader: true, ..PAIR_OF_SWAP };
+    let alternates = Budget { n_swaps: 1, node: Some(STATELESS), alternates: Some(1), ..KILLS };
+    let partners = |node| Budget { node: Some(node), has_partners: true, ..SWAP };
+    assert_whole(&[alternates, partners(STATELESS), partners(STATEFUL)]);
     assert_whole(&[KILLS, SWAP, ALL_OF_ONE, two_kills_and_a_swap]);
 }
 

@@ -289,9 +289,22 @@ impl Book {
         Ok(None)
     }
 
-    /// Drops the answers that were saved: they are made again.
-    pub(crate) fn forget_answers(&mut self) {
+    /// Takes over which samples are counted, for an instance that saves nothing and makes the saved answers again. The cursor
+    /// says that, except where the instance before was to answer counted samples again.
+    ///
+    /// # Errors
+    /// As [`Book::restore`].
+    pub(crate) fn restore_counts<S: Site>(&mut self, site: &S) -> anyhow::Result<()> {
+        self.restore(site, false)?;
+        for (idx, input) in self.inputs.iter_mut().enumerate() {
+            let (cursor, counts) = site.place(idx);
+            // A sample that was saved and not committed is counted when it is answered again.
+            if input.counts.n_received != counts.n_received {
+                (input.counted, input.counts) = (cursor, counts);
+            }
+        }
         self.outputs.iter_mut().for_each(|output| output.kept = Kept::default());
+        Ok(())
     }
 
     fn take_in(&mut self, mut found: Found<'_>, sent: &[Option<Written>]) {
@@ -457,6 +470,7 @@ mod tests {
         assert_eq!(found.state, b"mine");
         next.take_in(found, &[None, Some(Written { last: id(0), first_seq: 0, before: None })]);
         assert!(next.is_done);
+        assert!(is_at_most(id(7), Some(id(7))) && !is_at_most(id(7), Some(SampleId { epoch: 4, seq: 7 })));
         assert_eq!((next.inputs[0].last, &next.inputs[1]), (None, &book.inputs[0]));
         let [a, b] = &next.outputs[..] else { panic!("two outputs") };
         assert_eq!((a.kept.first_sent(), a.last, a.kept.entries().len()), (None, Some(id(9)), 1));

@@ -1,7 +1,7 @@
 //! The rules of a node for which the search through histories (`recovery_model.rs`) has no worlds: ends, silence and cuts,
 //! several inputs and outputs, batches, late samples, bells, and a standby.
 
-use std::cell::RefCell;
+use std::cell::{Cell, RefCell};
 
 use super::*;
 use crate::saved::Output;
@@ -36,6 +36,7 @@ struct Desk {
     known: [Option<SampleId>; 2],
     saved: Option<Vec<u8>>,
     sent: Vec<Header>,
+    is_at_work: Cell<bool>,
     names: RefCell<Vec<SampleId>>,
     said: RefCell<Vec<String>>,
 }
@@ -171,6 +172,7 @@ impl Site for Desk {
     }
     fn beat(&self) {}
     fn works_on(&self, sample: Option<SampleId>) {
+        self.is_at_work.set(sample.is_some());
         self.names.borrow_mut().extend(sample);
     }
     fn skips(&self, sample: SampleId) -> bool {
@@ -298,6 +300,7 @@ fn a_worker_hears_the_end_once_and_silence_by_the_clock_of_the_machine_alone() {
     assert_eq!(desk.said(), "begin 0 false");
     assert_eq!(done(&mut engine, &mut desk, 0, &[1]), "send 0.0, commit 0.0, send 0.1, commit 0.1, ring");
     assert_eq!((engine.worker.heard.len(), engine.next_seq()), (0, Some(2)));
+    assert!(engine.is_caught_up(&desk) && !engine.is_over(&desk));
     desk.is_live = true;
     assert_eq!(done(&mut engine, &mut desk, 0, &[]), "send 0.91, ring", "once in a turn");
     assert_eq!(desk.sent[2], Header { made_by: 1, ..header(91) });
@@ -355,6 +358,9 @@ fn counted_answers_to_several_inputs_have_gaps_where_samples_are_missing() {
     assert_eq!(done(&mut engine, &mut desk, 0, &[4]), "save, send 0.5, commit 0.4, ring");
     desk.skipped = Some(5);
     assert_eq!(done(&mut engine, &mut desk, 0, &[5, 6]), "save, commit 0.5, save, send 0.7, commit 0.6, ring");
+    desk.has_partners = true;
+    let said = done(&mut engine, &mut desk, 0, &[9]);
+    assert_eq!(said, "save, send 0.8, commit 0.9, answered Some(9), ring", "the saved state includes it");
     assert!(desk.sent.iter().all(|sent| sent.epoch == desk.sent[0].epoch && sent.epoch != 3));
     let names = desk.names.take();
     assert!(names[0].seq == names[1].seq && names[0] != names[1], "the launcher tells them apart: {names:?}");
@@ -391,7 +397,7 @@ fn a_batch_is_asked_at_once_unless_a_sample_is_suspect_or_the_worker_refuses() {
         assert_eq!(said.matches("commit").count(), 4, "{said}");
         let named: Vec<u64> = desk.names.take().iter().map(|name| name.seq).collect();
         assert_eq!(named, expected.iter().map(|batch| batch[0]).collect::<Vec<u64>>());
-        assert_eq!(engine.worker.asked, expected);
+        assert_eq!((engine.worker.asked, desk.is_at_work.get()), (expected, false));
     }
 }
 
@@ -499,6 +505,7 @@ fn a_source_goes_on_after_its_saved_samples_unless_it_has_sent_more_since() {
         assert_eq!((restored.is_some(), book.is_done), (is_used, is_used));
         assert_eq!(book.next_key(1), id(sent + 1));
     }
+    assert_eq!(header_of(&with_header(vec![0; 80], &header(7))), header(7));
     // A source in Rust has saved bytes of its own.
     desk.saved = Some(b"mine".to_vec());
     assert_eq!(book.restore(&desk, true).expect("not read"), None);
