@@ -33,6 +33,9 @@ pub(super) const TRANSFORMS: StandardType =
 pub const TOPICS_FOR_VIEWERS: [&str; 4] =
     [JOINT_STATES.topic, CONTACT_POINTS.topic, ROBOT_DESCRIPTION.topic, TRANSFORMS.topic];
 
+/// The poses of the hand's links at the joints' values.
+pub type LinkPoses = Arc<dyn Fn(&[f64]) -> Vec<LinkPose> + Send + Sync>;
+
 /// The hand of a recording as viewers draw it.
 #[derive(Clone)]
 pub struct ShownHand {
@@ -42,7 +45,7 @@ pub struct ShownHand {
     pub layout: String,
     pub urdf: String,
     /// The poses of the links for values of the joints.
-    pub link_poses: Arc<dyn Fn(&[f64]) -> Vec<LinkPose> + Send + Sync>,
+    pub link_poses: LinkPoses,
 }
 
 /// The pose of a link in the frame of its parent.
