@@ -4,12 +4,10 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, sync_channel};
-use std::time::Duration;
 
 use crate::control::{Reply, Request};
 use crate::dataflow::pins::Pins;
 use crate::dataflow::{Graph, Node, ParamKind, ProcessOptions, Restart};
-use crate::launcher::process::ProcessOutput;
 use crate::launcher::server::Ask;
 use crate::launcher::{LaunchOptions, Launcher};
 use crate::plan::{Plan, PlanOptions};
@@ -41,22 +39,8 @@ pub(super) fn launched(name: &str, script: &str, argument: &str) -> Launched {
     let name = format!("{name}-{}", std::process::id());
     let script =
         format!("exec 3> /dev/fd/$BLINDGRASP_REPORTS; echo '{{\"report\":\"ready\"}}' >&3; read -r go; {script}");
-    let votes = ParamKind::Integer { min: None, max: None };
-    let node = Node {
-        id: STUB.into(),
-        program: "/bin/sh".into(),
-        args: vec!["-c".into(), script, argument.into()],
-        description: OperatorDescription::new(STUB, "A stub").live_param("votes", votes, Some("3".into()), "Votes"),
-        inputs: Vec::new(),
-        params: [("votes".to_owned(), 3.into())].into_iter().collect(),
-        restart: Restart::default(),
-        heartbeat_millis: None,
-        sandbox: Sandbox::Off,
-        memory_max_mib: None,
-        process: ProcessOptions::default(),
-        sha256: Pins::default(),
-        machine: None,
-    };
+    let mut node = stub(STUB);
+    node.args = vec!["-c".into(), script, argument.into()];
     let graph = Graph {
         name: name.clone(),
         file: "/dataflow.yaml".into(),
@@ -77,6 +61,26 @@ pub(super) fn launched(name: &str, script: &str, argument: &str) -> Launched {
     Launched { launcher, _namespace: namespace, _logs: logs }
 }
 
+/// A node whose program is the shell.
+pub(super) fn stub(id: &str) -> Node {
+    let votes = ParamKind::Integer { min: None, max: None };
+    Node {
+        id: id.into(),
+        program: "/bin/sh".into(),
+        args: Vec::new(),
+        description: OperatorDescription::new(id, "A stub").live_param("votes", votes, Some("3".into()), "Votes"),
+        inputs: Vec::new(),
+        params: [("votes".to_owned(), 3.into())].into_iter().collect(),
+        restart: Restart::default(),
+        heartbeat_millis: None,
+        sandbox: Sandbox::Off,
+        memory_max_mib: None,
+        process: ProcessOptions::default(),
+        sha256: Pins::default(),
+        machine: None,
+    }
+}
+
 /// A request of a client, and its replies.
 pub(super) fn ask(request: Request) -> (Box<Ask>, Receiver<Reply>) {
     let (reply, replies) = sync_channel(8);
@@ -86,7 +90,7 @@ pub(super) fn ask(request: Request) -> (Box<Ask>, Receiver<Reply>) {
 /// Lets the launcher work until a condition holds.
 pub(super) fn work_until(launcher: &mut Launcher, mut is_so: impl FnMut(&Launcher) -> bool) {
     while !is_so(launcher) {
-        launcher.turn(Duration::from_millis(5)).expect("supervised");
+        launcher.turn().expect("supervised");
     }
 }
 
@@ -95,17 +99,17 @@ pub(super) fn work_until(launcher: &mut Launcher, mut is_so: impl FnMut(&Launche
 fn counts_of_a_state_are_those_of_the_active_process() {
     let mut graph = launched("counts", "exec cat > /dev/null", "");
     let launcher = &mut graph.launcher;
-    let id = launcher.members[0].active.as_ref().expect("a process").id;
+    let id = launcher.life.members[0].active.as_ref().expect("an instance").id;
     let shown_after = |launcher: &mut Launcher, kept: u64| {
         let counts = BTreeMap::from([("outcomes/kept".to_owned(), kept)]);
-        launcher.on_output(id, ProcessOutput::Report(Report::Counts { counts, in_all: true }));
+        launcher.on_output(id, Report::Counts { counts, in_all: true });
         launcher.status().nodes[0].counts.get("outcomes/kept").copied()
     };
     for (kept, shown) in [(0, None), (304, Some(304)), (7, Some(7)), (0, Some(0))] {
         assert_eq!(shown_after(launcher, kept), shown);
     }
     // A replacement that stands by counts for itself alone.
-    let member = &mut launcher.members[0];
+    let member = &mut launcher.life.members[0];
     std::mem::swap(&mut member.active, &mut member.standby);
     assert_eq!(shown_after(launcher, 12), Some(0));
 }
