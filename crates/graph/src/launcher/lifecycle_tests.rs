@@ -34,7 +34,9 @@ enum Fault {
     /// The machine has no process left for the next start, or its program never begins.
     NoProcess,
     NeverBegins,
-    /// The second node answers nothing any more.
+    /// It does not exit, although it may.
+    Lingers(usize),
+    /// The second node answers nothing any more, or has answered all again.
     FallsBehind,
     ClientGoes,
     Promote,
@@ -59,6 +61,7 @@ struct Process {
     is_killed: bool,
     hangs_since: Option<Duration>,
     is_stuck: bool,
+    lingers: bool,
     end: Option<i32>,
     commands: VecDeque<Command>,
 }
@@ -168,6 +171,15 @@ impl Surroundings for World {
     fn has_status(&mut self, _: &str) {}
 
     fn answer(&mut self, _: u64, reply: Reply) {
+        if let Reply::Swapped { nodes } = &reply {
+            for node in nodes {
+                let process = |pid: u32| self.processes.get(&u64::from(pid));
+                let has_ended = process(node.new_pid).is_some_and(|new| new.end.is_some());
+                let is_old_there = process(node.old_pid).is_some_and(|old| old.end.is_none() && !old.is_stuck);
+                let is_right = !(has_ended && is_old_there);
+                self.is_to_be(is_right, "the old instance takes over from one that dies on probation");
+            }
+        }
         if !matches!(reply, Reply::Progress { .. } | Reply::Shadowing { .. }) {
             self.replies.push(reply);
         }
@@ -250,7 +262,7 @@ impl History {
         history
     }
 
-    fn swap(&mut self, nodes: &[usize], shadow_limit_millis: u64) {
+    fn swap(&mut self, nodes: &[usize], shadow_limit_millis: u64, probation_millis: u64) {
         let request = SwapRequest {
             nodes: nodes.iter().map(|idx| NODES[*idx].into()).collect(),
             program: None,
@@ -259,7 +271,7 @@ impl History {
             folder: "/".into(),
             shadow_limit_millis,
             ready_limit_millis: 3000,
-            probation_millis: 500,
+            probation_millis,
             allow_mismatch: false,
         };
         self.life.begin_swap(request, None, CLIENT);
@@ -322,7 +334,7 @@ impl History {
         } else if process.is_asked && !process.is_drained {
             process.is_drained = true;
             Report::Drained
-        } else if process.is_let_go {
+        } else if process.is_let_go && !process.lingers {
             return self.end(id, 0);
         } else {
             return false;
@@ -360,7 +372,9 @@ impl History {
         let active = |node: usize| self.life.members[node].active.as_ref();
         let standby = |node: usize| self.life.members[node].standby.as_ref();
         let instance: Option<&Instance> = match fault {
-            Fault::Kill(node) | Fault::Exit(node) | Fault::Hang(node) | Fault::Stick(node) => active(node),
+            Fault::Kill(node) | Fault::Exit(node) | Fault::Hang(node) | Fault::Stick(node) | Fault::Lingers(node) => {
+                active(node)
+            }
             Fault::KillStandby(node) | Fault::HangStandby(node) => standby(node),
             _ => None,
         };
@@ -376,9 +390,16 @@ impl History {
                 process.is_stuck = matches!(fault, Fault::Stick(_));
                 true
             }
+            (Fault::Lingers(_), Some(id)) => {
+                let process = self.life.site.processes.get_mut(&id).expect("it is there");
+                !std::mem::replace(&mut process.lingers, true)
+            }
             (Fault::NoProcess, _) => !std::mem::replace(&mut self.life.site.has_no_process, true),
             (Fault::NeverBegins, _) => !std::mem::replace(&mut self.life.site.never_begins, true),
-            (Fault::FallsBehind, _) => !std::mem::replace(&mut self.life.site.falls_behind, true),
+            (Fault::FallsBehind, _) => {
+                self.life.site.falls_behind = !self.life.site.falls_behind;
+                true
+            }
             (Fault::ClientGoes, _) => {
                 self.life.on_client_gone(CLIENT);
                 true
@@ -422,7 +443,8 @@ impl History {
             let active = member.active.as_ref().expect("it is whole");
             let process = &self.life.site.processes[&active.id];
             let is_new = process.votes == 5;
-            let answers = process.is_active && member.standby.is_none() && member.state == NodeState::Running;
+            let is_settled = member.standby.is_none() && member.restart_at.is_none();
+            let answers = process.is_active && is_settled && member.state == NodeState::Running;
             let votes = member.node.params["votes"].as_u64();
             let is_swapped = matches!(self.life.site.replies[0], Reply::Swapped { .. });
             let is_right = answers && votes == Some(process.votes) && (is_swapped || !is_new);
@@ -491,13 +513,19 @@ fn search(mut history: History, faults: &[Fault], n_faults: usize, found: &mut F
     history.stop();
 }
 
-fn searched(nodes: &[usize], shadow_limit_millis: u64, faults: &[Fault], n_faults: usize) -> Found {
-    let mut history = History::new();
-    history.swap(nodes, shadow_limit_millis);
+fn searched(mut history: History, faults: &[Fault], n_faults: usize) -> Found {
+    history.faults.clear();
     let mut found = Found::default();
     search(history, faults, n_faults, &mut found);
     println!("{} histories", found.n_histories);
     found
+}
+
+/// A graph in which a swap has just been asked for.
+fn swapping(nodes: &[usize], shadow_limit_millis: u64, probation_millis: u64) -> History {
+    let mut history = History::new();
+    history.swap(nodes, shadow_limit_millis, probation_millis);
+    history
 }
 
 #[test]
@@ -509,28 +537,45 @@ fn a_swap_of_a_node_outlives_two_faults_at_any_moments() {
         Fault::Hang(1),
         Fault::HangStandby(1),
         Fault::Stick(1),
+        Fault::Lingers(1),
         Fault::NoProcess,
         Fault::NeverBegins,
         Fault::ClientGoes,
         Fault::Stop,
     ];
-    let found = searched(&[1], 0, &faults, 3);
+    let found = searched(swapping(&[1], 0, 500), &faults, 2);
     assert!(found.swapped > 0 && found.rolled_back > 0 && found.abandoned > 0 && found.given_up > 0);
 }
 
 #[test]
-fn a_swap_of_two_nodes_outlives_a_fault_of_either_and_of_a_neighbour() {
+fn a_swap_of_two_nodes_outlives_faults_of_both_and_of_a_neighbour() {
     let mut faults = vec![Fault::FallsBehind, Fault::ClientGoes, Fault::Stop, Fault::NeverBegins, Fault::NoProcess];
     for node in 0..NODES.len() {
         faults.extend([Fault::Kill(node), Fault::Exit(node), Fault::Hang(node)]);
         faults.extend([Fault::KillStandby(node), Fault::HangStandby(node)]);
     }
-    let found = searched(&[1, 2], 0, &faults, 2);
+    let found = searched(swapping(&[1, 2], 0, 500), &faults, 2);
     assert!(found.swapped > 0 && found.rolled_back > 0 && found.abandoned > 0);
 }
 
+/// The first of them dies while the other one delays the hand-over, and its restart is due in the midst of it.
 #[test]
-fn a_comparison_ends_by_its_client_or_by_its_limit() {
-    let found = searched(&[1], 1000, &[Fault::Promote, Fault::ClientGoes, Fault::Kill(1), Fault::Stop], 2);
+fn a_node_is_not_started_again_while_it_is_handed_over() {
+    let mut history = swapping(&[1, 2], 0, 500);
+    while history.life.members[2].standby.as_ref().is_some_and(|standby| standby.pid.is_none()) {
+        history.tick();
+    }
+    assert!(history.suffers(Fault::NoProcess) && history.suffers(Fault::FallsBehind));
+    let found = searched(history, &[Fault::Kill(1), Fault::FallsBehind, Fault::Stop], 2);
     assert!(found.swapped > 0 && found.abandoned > 0);
+}
+
+#[test]
+fn a_comparison_and_a_long_probation_end_with_their_graph() {
+    let found =
+        searched(swapping(&[1], 1000, 500), &[Fault::Promote, Fault::ClientGoes, Fault::Kill(1), Fault::Stop], 2);
+    assert!(found.swapped > 0 && found.abandoned > 0);
+    let long_millis = LIMIT.as_millis() as u64 + 5000;
+    let found = searched(swapping(&[1], 0, long_millis), &[Fault::ClientGoes, Fault::Kill(1), Fault::Stop], 1);
+    assert!(found.swapped > 0 && found.rolled_back > 0);
 }

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, sync_channel};
 
-use crate::control::{Reply, Request};
+use crate::control::{NodeState, Reply, Request, SwapRequest};
 use crate::dataflow::pins::Pins;
 use crate::dataflow::{Graph, Node, ParamKind, ProcessOptions, Restart};
 use crate::launcher::server::Ask;
@@ -112,4 +112,55 @@ fn counts_of_a_state_are_those_of_the_active_process() {
     let member = &mut launcher.life.members[0];
     std::mem::swap(&mut member.active, &mut member.standby);
     assert_eq!(shown_after(launcher, 12), Some(0));
+}
+
+/// The same rules with real processes, each in its order; `lifecycle_tests` has them in all others.
+#[test]
+fn a_process_is_started_again_swapped_taken_back_and_ended() {
+    let script = r#"trap 'echo "{\"report\":\"drained\"}" >&3' TERM
+        while read -r line; do
+            case "$line" in
+                *hand_over*) echo '{"report":"handed_over","has_sent_all":true}' >&3 ;;
+                *take_over*) echo '{"report":"took_over"}' >&3 ;;
+            esac
+        done"#;
+    let mut graph = launched("whole-life", script, "");
+    let launcher = &mut graph.launcher;
+    let swap = |votes: u32, probation_millis: u64| {
+        ask(Request::Swap(SwapRequest {
+            nodes: vec![STUB.into()],
+            program: None,
+            args: None,
+            set: BTreeMap::from([("votes".into(), votes.to_string())]),
+            folder: "/".into(),
+            shadow_limit_millis: 0,
+            ready_limit_millis: 60_000,
+            probation_millis,
+            allow_mismatch: false,
+        }))
+    };
+    let kill = |pid: Option<u32>| {
+        let pid = rustix::process::Pid::from_raw(pid.expect("a process") as i32).expect("a number");
+        rustix::process::kill_process(pid, rustix::process::Signal::KILL).expect("killed");
+    };
+    let stub = |launcher: &Launcher| launcher.status().nodes.remove(0);
+    kill(stub(launcher).pid);
+    work_until(launcher, |launcher| stub(launcher).n_restarts == 1 && stub(launcher).state == NodeState::Running);
+    let (asked, replies) = swap(5, 0);
+    launcher.on_ask(asked);
+    work_until(launcher, |launcher| stub(launcher).n_swaps == 1);
+    assert!(matches!(replies.try_iter().last(), Some(Reply::Swapped { .. })));
+    assert_eq!(stub(launcher).params["votes"], 5);
+    let old = stub(launcher).pid;
+    let (asked, replies) = swap(7, 600_000);
+    launcher.on_ask(asked);
+    let on_probation = |reply: &Reply| matches!(reply, Reply::Progress { message } if message.contains("on probation"));
+    work_until(launcher, |_| replies.try_iter().any(|reply| on_probation(&reply)));
+    assert_eq!(stub(launcher).standby_pid, old);
+    kill(stub(launcher).pid);
+    work_until(launcher, |launcher| launcher.life.swap.is_none());
+    assert!(matches!(replies.try_iter().last(), Some(Reply::Error { rolled_back: true, .. })));
+    assert_eq!((stub(launcher).pid, &stub(launcher).params["votes"]), (old, &5.into()));
+    launcher.drain(&|| false).expect("drained");
+    launcher.quit(&|| false).expect("ended");
 }
