@@ -142,12 +142,7 @@ impl<S: Surroundings> Lifecycle<S> {
         }
     }
 
-    /// The replacements, checked against the graph as it runs.
-    fn plan_swap(
-        &self,
-        request: &SwapRequest,
-        description: Option<Result<OperatorDescription, String>>,
-    ) -> Result<Vec<Target>, String> {
+    fn check_readiness(&self) -> Result<(), String> {
         if !matches!(self.state, GraphState::Running | GraphState::Degraded) {
             return Err("the graph is starting or stopping".into());
         }
@@ -155,6 +150,16 @@ impl<S: Surroundings> Lifecycle<S> {
             let nodes: Vec<_> = swap.targets.iter().map(|target| target.node.id.as_str()).collect();
             return Err(format!("a swap of {} is under way; wait for its end", nodes.join(", ")));
         }
+        Ok(())
+    }
+
+    /// The replacements, checked against the graph as it runs.
+    fn plan_swap(
+        &self,
+        request: &SwapRequest,
+        description: Option<Result<OperatorDescription, String>>,
+    ) -> Result<Vec<Target>, String> {
+        self.check_readiness()?;
         let description =
             description.transpose().map_err(|error| format!("the replacement cannot be used: {error}"))?;
         let asked = request.nodes.iter().map(|id| self.member_idx(id)).collect::<Result<Vec<_>, _>>()?;
