@@ -52,7 +52,7 @@ pub use parts::{Manifest, part_path, recordings_in};
 pub use problems::{Oddity, Problem, Problems};
 pub use reader::RecordingReader;
 pub use repair::{RepairReport, repair, repaired_path};
-pub use viewer::{LinkPose, ShownHand, TOPICS_FOR_VIEWERS};
+pub use viewer::{LinkPose, LinkPoses, ShownHand, TOPICS_FOR_VIEWERS};
 pub use writer::RecordingWriter;
 
 /// The metadata with a recording's [`RecordingInfo`].

@@ -11,6 +11,7 @@ use std::time::{Duration, Instant};
 use crate::control::{AttachedEdge, Attachment, GraphState, Reply};
 use crate::dataflow::Node;
 use crate::launcher::Launcher;
+use crate::launcher::lifecycle::Surroundings;
 use crate::plan::{N_ATTACHED, Port};
 use crate::recorded_graph::describe_graph;
 use blindgrasp_operator::text::did_you_mean;
@@ -36,8 +37,7 @@ impl Launcher {
         let attached = self.free_place(client).and_then(|place| Ok((place, self.attachment(ports, place)?)));
         let answer = match attached {
             Ok((place, attachment)) => {
-                self.clients.attached[place] =
-                    Some(AttachedReader { client, reply: reply.clone(), is_flight_recorder });
+                self.attached[place] = Some(AttachedReader { client, reply: reply.clone(), is_flight_recorder });
                 Reply::Attached(attachment)
             }
             Err(message) => Reply::refusal(message),
@@ -47,83 +47,85 @@ impl Launcher {
 
     /// Asks the flight recorders for a file.
     pub(super) fn ask_flight_recorders(&self) -> Reply {
-        let recorders = self.clients.attached.iter().flatten().filter(|reader| reader.is_flight_recorder);
+        let recorders = self.attached.iter().flatten().filter(|reader| reader.is_flight_recorder);
         let n_flight_recorders = recorders.filter(|reader| reader.reply.try_send(Reply::Keep).is_ok()).count();
         Reply::Asked { n_flight_recorders }
     }
 
     fn free_place(&self, client: u64) -> Result<usize, String> {
-        if self.state == GraphState::Stopping {
-            return Err(format!("graph '{}' is stopping", self.name));
+        if self.life.state == GraphState::Stopping {
+            return Err(format!("graph '{}' is stopping", self.life.name));
         }
-        if self.clients.attached.iter().flatten().any(|reader| reader.client == client) {
+        if self.attached.iter().flatten().any(|reader| reader.client == client) {
             return Err("this connection is attached already".into());
         }
-        self.clients.attached.iter().position(Option::is_none).ok_or_else(|| {
+        self.attached.iter().position(Option::is_none).ok_or_else(|| {
             format!(
                 "graph '{}' is being recorded by {N_ATTACHED} already, which is the most: wait until one of them has ended",
-                self.name
+                self.life.name
             )
         })
     }
 
     fn attachment(&self, wanted: &[String], place: usize) -> Result<Attachment, String> {
-        let nodes = self.members.iter().map(|member| &member.node);
+        let nodes = self.life.members.iter().map(|member| &member.node);
+        let plan = &self.life.site.plan;
         let all: Vec<Port> = nodes.clone().flat_map(Node::output_ports).map(|(port, _)| port).collect();
         // NODE/PORT, the topic of a recording, with or without its '/', or a node with all its outputs.
         let is_named = |port: &Port, wanted: &str| {
             let wanted = wanted.trim_start_matches('/');
-            name_of(port) == wanted || self.plan.topic(port).trim_start_matches('/') == wanted || port.0 == wanted
+            name_of(port) == wanted || plan.topic(port).trim_start_matches('/') == wanted || port.0 == wanted
         };
         if let Some(unknown) = wanted.iter().find(|wanted| !all.iter().any(|port| is_named(port, wanted))) {
             let known: Vec<String> = all.iter().map(name_of).collect();
             let alike = did_you_mean(unknown, known.iter().map(String::as_str));
             let alike = alike.map(|alike| format!("; {alike}")).unwrap_or_default();
             let known = known.join(", ");
-            return Err(format!("graph '{}' has no edge from '{unknown}'; it has: {known}{alike}", self.name));
+            return Err(format!("graph '{}' has no edge from '{unknown}'; it has: {known}{alike}", self.life.name));
         }
-        let is_at_start = all.iter().all(|port| self.last_sent_at(port).is_none());
+        let is_at_start = all.iter().all(|port| self.life.site.last_sent_at(port).is_none());
         let mut edges = Vec::new();
         for port in &all {
             if (wanted.is_empty() || wanted.iter().any(|wanted| is_named(port, wanted)))
-                && let Some(input) = self.plan.attached_input(port, place)
+                && let Some(input) = plan.attached_input(port, place)
             {
-                let answered_slots = self.plan.input_slots(&port.0).collect();
-                edges.push(AttachedEdge { port: name_of(port), topic: self.plan.topic(port), input, answered_slots });
+                let answered_slots = plan.input_slots(&port.0).collect();
+                edges.push(AttachedEdge { port: name_of(port), topic: plan.topic(port), input, answered_slots });
             }
         }
         Ok(Attachment {
-            domain: self.plan.domain().clone(),
+            domain: plan.domain().clone(),
             edges,
-            graph: describe_graph(&self.name, nodes),
+            graph: describe_graph(&self.life.name, nodes),
             is_at_start,
         })
-    }
-
-    pub(super) fn last_sent_at(&self, port: &Port) -> Option<blindgrasp_operator::cursors::SampleId> {
-        self.cursors.output(self.plan.output_slot(port)?).key()
     }
 
     /// Frees the slots of a client that has gone.
     pub(super) fn release_attached(&mut self, client: u64) {
         for idx in 0..N_ATTACHED {
-            if self.clients.attached[idx].take_if(|reader| reader.client == client).is_some() {
-                self.plan.attached_slots(idx).into_iter().for_each(|slot| self.cursors.input(slot).give_up(true));
+            if self.attached[idx].take_if(|reader| reader.client == client).is_some() {
+                self.life
+                    .site
+                    .plan
+                    .attached_slots(idx)
+                    .into_iter()
+                    .for_each(|slot| self.life.site.cursors.input(slot).give_up(true));
                 // It may have been killed.
-                self.reap();
+                self.life.site.reap();
             }
         }
     }
 
     /// Tells the attached readers that all has been sent, and waits a little until they have read it and gone.
     pub(super) fn retire_attached(&mut self, should_hurry: &dyn Fn() -> bool) {
-        for reader in self.clients.attached.iter().flatten() {
+        for reader in self.attached.iter().flatten() {
             let _ = reader.reply.try_send(Reply::Drained);
         }
         let start = Instant::now();
-        while self.clients.attached.iter().any(Option::is_some) && start.elapsed() < RETIRE_LIMIT && !should_hurry() {
-            self.listen(Duration::from_millis(1));
-            self.kill_hung();
+        while self.attached.iter().any(Option::is_some) && start.elapsed() < RETIRE_LIMIT && !should_hurry() {
+            // All are drained, and what happens to them now is seen when they exit.
+            let _ = self.turn();
         }
     }
 }

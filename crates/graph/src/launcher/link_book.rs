@@ -10,7 +10,7 @@ use blindgrasp_operator::link_status::{LinkStatus, PeerState};
 const AWAY_MILLIS: u64 = 3000;
 
 /// What the link to the other machines has said, over all its processes.
-#[derive(Default)]
+#[derive(Clone, Default)]
 pub(super) struct LinkBook {
     /// The ports that come from other machines; `None` for a graph on one machine.
     local: Option<LocalView>,

@@ -1,10 +1,10 @@
 //! One operator process: its start, its output, its commands and its end.
 
 use std::cell::RefCell;
-use std::collections::{BTreeMap, VecDeque};
+use std::collections::VecDeque;
 use std::io::{BufRead, BufReader, PipeReader, PipeWriter, Read, Write};
 use std::os::fd::{AsRawFd, BorrowedFd, RawFd};
-use std::os::unix::process::{CommandExt, ExitStatusExt};
+use std::os::unix::process::CommandExt;
 use std::process::{Child, ChildStdin, Command as Program, ExitStatus, Stdio};
 use std::rc::Rc;
 use std::sync::mpsc::{Sender, SyncSender};
@@ -20,14 +20,13 @@ use rustix::thread::{CpuSet, sched_setaffinity, set_no_new_privs};
 
 use crate::dataflow::{self, Node, ProcessOptions, Scheduling, SchedulingPolicy};
 use crate::launcher::Event;
+use crate::launcher::lifecycle::KILL_LIMIT;
 use crate::launcher::log_writer::Log;
 use crate::launcher::service;
 use crate::log::printable;
 use blindgrasp_operator::diagnostics::LinePrinter;
-use blindgrasp_operator::namespace;
 use blindgrasp_operator::wiring::{
-    Addressed, Command, Enforcement, GroupMemberWiring, GroupWiring, LogEntry, REPORTS_VARIABLE, Report, Sandbox,
-    WIRING_VARIABLE, Wiring,
+    Addressed, Command, GroupMemberWiring, GroupWiring, LogEntry, REPORTS_VARIABLE, Report, WIRING_VARIABLE, Wiring,
 };
 
 /// The environment of a process that opens TLS connections: its Zenoh receives and sends on one thread. It reads and writes a
@@ -41,55 +40,15 @@ const GROUP_ARGS: [&str; 2] = ["operator", "group"];
 const MAX_LINE_BYTES: u64 = 64 << 10;
 /// The last log lines of an operator explain its failure.
 const N_KEPT_LINES: usize = 20;
-/// A killed process ends within this time, unless it waits for a device.
-const KILL_LIMIT: Duration = Duration::from_secs(1);
 const KILL_POLL: Duration = Duration::from_micros(200);
 /// Commands of this many bytes may wait for an operator that does not read them.
 const MAX_UNWRITTEN: usize = 4 << 20;
 
-#[derive(Debug)]
-pub(super) enum ProcessOutput {
-    Report(Report),
-    /// It has closed the pipe for its reports, and is ending, most likely.
-    Closed,
-}
-
 /// A process of a node.
 pub(super) struct Process {
-    /// Unique among all processes of this launch.
-    pub(super) id: u64,
-    pub(super) started: Instant,
     /// Its heartbeat's slot on the cursors.
     pub(super) instance_slot: usize,
-    /// Its identity, once it is ready.
-    pub(super) identity: Option<BTreeMap<String, String>>,
-    /// Its answers depend on earlier samples.
-    pub(super) has_state: bool,
-    /// It is a source that has ended, or an operator that is drained.
-    pub(super) is_done: bool,
-    /// It was asked to drain.
-    pub(super) is_asked: bool,
-    /// It has drained although the launcher did not ask it.
-    is_stopped: bool,
-    /// It is a link, and the other machines are there.
-    pub(super) is_connected: bool,
-    /// Its answer to the last [`Command::HandOver`].
-    pub(super) has_handed_over: bool,
-    /// Whether the samples that it, and those before it, had sent when it handed over can all be received.
-    pub(super) has_sent_all: bool,
-    /// Its answer to the last [`Command::TakeOver`].
-    pub(super) has_taken_over: bool,
-    /// It has computed samples as a standby.
-    pub(super) is_warm: bool,
-    /// Its counts of other things than samples, since it started.
-    pub(super) counts: BTreeMap<String, u64>,
-    /// The launcher's reason to end it.
-    pub(super) finding: Option<String>,
     pub(super) exit: Option<ExitStatus>,
-    /// What the node's sandbox is to be, and what the process says of it.
-    wanted_sandbox: Sandbox,
-    pub(super) sandbox: Enforcement,
-    memory_max_mib: Option<u64>,
     lines: Lines,
     /// The process of the system; nodes of a group share it.
     shared: Rc<RefCell<Shared>>,
@@ -107,19 +66,16 @@ struct Shared {
     /// The commands that its stdin has no room for yet.
     unwritten: Vec<u8>,
     exit: Option<ExitStatus>,
-    /// Its report that it cannot go on. It ends all its nodes, so it is the failure of each of them.
-    failure: Option<String>,
-    /// It was killed, and the kernel has not ended it yet: it waits for a device, and computes nothing any more.
-    is_killed: bool,
+    killed: Option<Instant>,
     /// So many of its nodes still need it.
     n_needed: usize,
 }
 
 /// A node to start.
-pub(super) struct Start<'a> {
-    /// Of the process, unique among all of this launch.
+pub(super) struct Start {
+    /// Of the instance, unique among all of this launch.
     pub(super) id: u64,
-    pub(super) node: &'a Node,
+    pub(super) node: Node,
     pub(super) wiring: Wiring,
     pub(super) sink: LineSink,
 }
@@ -165,10 +121,10 @@ impl PreparedProgram {
     /// # Errors
     /// The system has no descriptors left, or the nodes have no such program.
     pub(super) fn of(
-        starts: &[Start<'_>],
+        starts: &[Start],
         host: Option<&dataflow::Program>,
     ) -> std::io::Result<(PreparedProgram, PipeReader)> {
-        let node = starts.first().ok_or(std::io::ErrorKind::InvalidInput)?.node;
+        let node = &starts.first().ok_or(std::io::ErrorKind::InvalidInput)?.node;
         let mut command = wired_program(node, starts, host)?;
         // Text for the log has a pipe, and reports have another: no text is ever a report.
         let (lines, its_lines) = std::io::pipe()?;
@@ -211,6 +167,12 @@ impl PreparedProgram {
     }
 }
 
+impl BegunProgram {
+    pub(super) fn pid(&self) -> u32 {
+        self.child.0.as_ref().map_or(0, Child::id)
+    }
+}
+
 impl Drop for Unclaimed {
     fn drop(&mut self) {
         if let Some(child) = &mut self.0 {
@@ -227,7 +189,7 @@ impl Process {
     /// # Errors
     /// The system has no threads left.
     pub(super) fn of(
-        starts: &[Start<'_>],
+        starts: &[Start],
         begun: BegunProgram,
         events: &SyncSender<Event>,
     ) -> std::io::Result<Vec<Process>> {
@@ -244,108 +206,21 @@ impl Process {
             rustix::io::ioctl_fionbio(stdin, true)?;
         }
         let n_needed = starts.len();
-        let shared = Shared {
-            child,
-            _life: life,
-            stdin,
-            unwritten: Vec::new(),
-            exit: None,
-            failure: None,
-            is_killed: false,
-            n_needed,
-        };
+        let shared = Shared { child, _life: life, stdin, unwritten: Vec::new(), exit: None, killed: None, n_needed };
         let shared = Rc::new(RefCell::new(shared));
         Ok(starts.iter().zip(hearers).map(|(start, hearer)| Process::new(start, hearer.lines, &shared)).collect())
     }
 
-    fn new(start: &Start<'_>, lines: Lines, shared: &Rc<RefCell<Shared>>) -> Process {
+    fn new(start: &Start, lines: Lines, shared: &Rc<RefCell<Shared>>) -> Process {
         let is_alone = shared.borrow().n_needed == 1;
         Process {
-            id: start.id,
-            started: Instant::now(),
             instance_slot: start.wiring.instance_slot,
-            identity: None,
-            has_state: false,
-            is_done: false,
-            is_asked: false,
-            is_stopped: false,
-            is_connected: false,
-            has_handed_over: false,
-            has_sent_all: false,
-            has_taken_over: false,
-            is_warm: false,
-            counts: BTreeMap::new(),
-            finding: None,
             exit: None,
-            wanted_sandbox: start.node.sandbox,
-            sandbox: Enforcement::default(),
-            memory_max_mib: start.node.memory_max_mib,
             lines,
             shared: Rc::clone(shared),
             addressee: if is_alone { None } else { Some(start.node.id.clone()) },
             is_let_go: false,
         }
-    }
-
-    pub(super) fn pid(&self) -> u32 {
-        self.shared.borrow().child.id()
-    }
-
-    /// Whether it can answer samples.
-    pub(super) fn is_ready(&self) -> bool {
-        self.identity.is_some()
-    }
-
-    /// Its report that it cannot go on.
-    pub(super) fn failure(&self) -> Option<String> {
-        self.shared.borrow().failure.clone()
-    }
-
-    /// Whether it has not ended.
-    pub(super) fn is_running(&self) -> bool {
-        self.exit.is_none() && !self.shared.borrow().is_killed
-    }
-
-    /// Whether it has drained at a signal that was not the launcher's.
-    pub(super) fn is_stopped_by_somebody_else(&self) -> bool {
-        self.is_stopped && !self.is_asked && self.is_running()
-    }
-
-    pub(super) fn on_report(&mut self, report: Report) {
-        match report {
-            Report::Ready { sandbox, .. }
-                if self.wanted_sandbox == Sandbox::Required && sandbox != Enforcement::Full =>
-            {
-                self.shared.borrow_mut().failure = Some(format!("its sandbox is required, and {}", lacking(sandbox)));
-                self.kill_group();
-            }
-            Report::Ready { identity, has_state, sandbox } => {
-                self.identity = Some(identity);
-                self.has_state = has_state;
-                self.sandbox = sandbox;
-            }
-            Report::HandedOver { has_sent_all } => (self.has_handed_over, self.has_sent_all) = (true, has_sent_all),
-            Report::TookOver => self.has_taken_over = true,
-            Report::Warm { .. } => self.is_warm = true,
-            Report::Counts { counts, in_all: false } => self.counts = counts,
-            Report::Connected => self.is_connected = true,
-            Report::Finished => self.is_done = true,
-            Report::Drained if self.is_asked => self.is_done = true,
-            Report::Drained => self.is_stopped = true,
-            Report::Failed { message } => self.shared.borrow_mut().failure = Some(message),
-            Report::Counts { in_all: true, .. }
-            | Report::Log(_)
-            | Report::Set { .. }
-            | Report::Ended { .. }
-            | Report::Link(_)
-            | Report::Unfit { .. } => {}
-        }
-    }
-
-    /// What its sandbox lacks, for a person; `None` if the file asks for none, or it has all.
-    pub(super) fn lacks_sandbox(&self) -> Option<&'static str> {
-        let is_lacking = self.wanted_sandbox == Sandbox::On && self.sandbox != Enforcement::Full;
-        is_lacking.then(|| lacking(self.sandbox))
     }
 
     /// Its last log lines, which explain a failure.
@@ -379,13 +254,7 @@ impl Process {
         }
     }
 
-    /// Whether no node needs it any more.
-    pub(super) fn is_needed_by_none(&self) -> bool {
-        self.shared.borrow().n_needed == 0
-    }
-
     pub(super) fn ask_to_drain(&mut self) {
-        self.is_asked = true;
         match self.addressee {
             Some(_) => self.tell(&Command::Drain),
             None => self.shared.borrow().signal(Signal::TERM),
@@ -403,65 +272,14 @@ impl Process {
         self.exit.is_some()
     }
 
-    /// Kills it and its children, and waits for its end for a bounded time; false if it had ended before.
-    pub(super) fn kill(&mut self) -> bool {
-        self.look();
+    /// Kills it and its children. It does not wait for its end.
+    pub(super) fn kill(&mut self) {
+        let mut shared = self.shared.borrow_mut();
+        shared.look();
         // Looking has killed the children of an ended process; its number may belong to another process by now.
-        if !self.is_running() {
-            return false;
-        }
-        self.kill_group();
-        let start = Instant::now();
-        while !self.look() && start.elapsed() < KILL_LIMIT {
-            std::thread::sleep(KILL_POLL);
-        }
-        self.shared.borrow_mut().is_killed = true;
-        true
-    }
-
-    fn kill_group(&self) {
-        self.shared.borrow().kill_group();
-    }
-
-    /// Whether it ended as it was asked to. A process that was asked to stop before it could listen ends by the signal
-    /// itself.
-    pub(super) fn has_ended_well(&self) -> bool {
-        self.failure().is_none()
-            && self.exit.is_some_and(|status| {
-                status.success() || (self.is_asked && status.signal() == Some(Signal::TERM.as_raw()))
-            })
-    }
-
-    /// Whether it has died of shared memory that was not there when it was written to, or could not begin without it.
-    pub(super) fn has_died_of_full_memory(&self) -> bool {
-        let wrote_in_vain = self.exit.is_some_and(|status| status.signal() == Some(Signal::BUS.as_raw()));
-        (wrote_in_vain || !self.is_ready()) && namespace::is_full()
-    }
-
-    /// How it ended, for a person: "failed: …", "was killed (signal 9)", "ended with exit status 1".
-    pub(super) fn ending(&self) -> String {
-        if let Some(finding) = &self.finding {
-            return finding.clone();
-        }
-        match (self.failure(), self.exit) {
-            (Some(message), _) => format!("failed: {message}"),
-            (None, Some(status)) => match status.signal() {
-                // Memory of a full /dev/shm is there only until it is written to.
-                Some(signal) if signal == Signal::BUS.as_raw() => {
-                    format!("was killed (signal {signal}: shared memory is full, most likely)")
-                }
-                Some(signal) => match self.memory_max_mib {
-                    Some(mib) if signal == Signal::ABORT.as_raw() => {
-                        format!("was killed (signal {signal}; its memory_max_mib is {mib})")
-                    }
-                    _ => format!("was killed (signal {signal})"),
-                },
-                None => format!("ended ({status})"),
-            },
-            (None, None) if self.shared.borrow().is_killed => {
-                "was killed and has not ended: it waits for a device".into()
-            }
-            (None, None) => "is running".into(),
+        if shared.exit.is_none() && shared.killed.is_none() {
+            shared.kill_group();
+            shared.killed = Some(Instant::now());
         }
     }
 }
@@ -518,13 +336,18 @@ impl Shared {
 }
 
 impl Drop for Process {
+    /// Kills it, and waits for its end for a bounded time.
     fn drop(&mut self) {
         self.kill();
+        let killed = self.shared.borrow().killed;
+        while !self.look() && self.exit.is_none() && killed.is_some_and(|killed| killed.elapsed() < KILL_LIMIT) {
+            std::thread::sleep(KILL_POLL);
+        }
     }
 }
 
 /// The program of a node, or of the nodes of a group, with its arguments and its wiring.
-fn wired_program(node: &Node, starts: &[Start<'_>], host: Option<&dataflow::Program>) -> std::io::Result<Program> {
+fn wired_program(node: &Node, starts: &[Start], host: Option<&dataflow::Program>) -> std::io::Result<Program> {
     let mut command = Program::new(&node.program);
     if node.description.hosted {
         let Some(host) = host else {
@@ -623,19 +446,6 @@ fn explain(error: std::io::Error, options: &ProcessOptions) -> std::io::Error {
     std::io::Error::new(error.kind(), format!("{error}; {advice}"))
 }
 
-fn lacking(sandbox: Enforcement) -> &'static str {
-    match sandbox {
-        Enforcement::None => {
-            "it is not restricted: the kernel has no Landlock (blindgrasp doctor tells), or its program does not use it"
-        }
-        Enforcement::Partial => {
-            "it is restricted in part only: the kernel is older than Linux 6.12, or its program is not blindgrasp's own and may \
-             read files and run programs"
-        }
-        Enforcement::Full => "it is restricted in full",
-    }
-}
-
 /// Hears a process until its end, on a thread for its lines and one for its reports.
 fn hear(lines: PipeReader, reports: PipeReader, hearers: &[Hearer], events: &SyncSender<Event>) -> std::io::Result<()> {
     let first = hearers[0].clone();
@@ -673,7 +483,7 @@ fn forward_reports(stream: impl Read, hearers: &[Hearer], events: &SyncSender<Ev
                 match message {
                     Report::Log(entry) => hearer.take(entry),
                     report => {
-                        if events.send(Event::Output(hearer.id, ProcessOutput::Report(report))).is_err() {
+                        if events.send(Event::Output(hearer.id, report)).is_err() {
                             return;
                         }
                     }
@@ -685,7 +495,7 @@ fn forward_reports(stream: impl Read, hearers: &[Hearer], events: &SyncSender<Ev
             }
         }
     }
-    let _ = events.send(Event::Output(first.id, ProcessOutput::Closed));
+    let _ = events.send(Event::Closed);
 }
 
 /// Reads a line, or the first part of a long one; false at the end.
@@ -765,14 +575,7 @@ mod tests {
         );
         forward_reports(said.as_bytes(), std::slice::from_ref(&hearer), &events);
         let heard: Vec<Event> = heard.try_iter().collect();
-        assert!(
-            matches!(
-                heard.as_slice(),
-                [Event::Output(7, ProcessOutput::Report(Report::Drained)), Event::Output(7, ProcessOutput::Closed)]
-            ),
-            "{}",
-            heard.len()
-        );
+        assert!(matches!(heard.as_slice(), [Event::Output(7, Report::Drained), Event::Closed]), "{}", heard.len());
         let lines = logged(&hearer);
         assert!(lines.len() == 3 && lines[2] == "a line", "{lines:?}");
         assert!(lines[..2].iter().all(|line| line.starts_with("not a report of this version")), "{lines:?}");

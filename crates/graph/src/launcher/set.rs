@@ -10,6 +10,7 @@ use serde_json::{Map, Value};
 
 use crate::control::Reply;
 use crate::launcher::Launcher;
+use crate::launcher::lifecycle::Surroundings;
 use blindgrasp_operator::wiring::Command;
 
 /// An operator must apply a parameter within this time.
@@ -19,9 +20,9 @@ const SET_LIMIT: Duration = Duration::from_secs(5);
 pub(super) struct PendingSet {
     /// Of the command.
     id: u64,
-    /// The index of the node among the members, and the id of its process.
+    /// The index of the node among the members, and the id of its instance.
     idx: usize,
-    process: u64,
+    instance: u64,
     param: String,
     old: Value,
     new: Value,
@@ -46,18 +47,18 @@ impl Launcher {
         value: &Value,
         reply: &SyncSender<Reply>,
     ) -> Result<(), String> {
-        let idx = self.member_idx(id)?;
-        if self.swap.as_ref().is_some_and(|swap| swap.concerns(id)) {
+        let idx = self.life.member_idx(id)?;
+        if self.life.swap.as_ref().is_some_and(|swap| swap.concerns(id)) {
             return Err(format!("node '{id}' is being swapped; try again when that is over"));
         }
-        let member = &mut self.members[idx];
+        let member = &self.life.members[idx];
         let description = &member.node.description;
         crate::dataflow::live_param(description, &param)?;
-        let new = crate::dataflow::accept_param_value(description, &param, value, &self.folder)?;
-        let Some(process) = member.active.as_mut().filter(|process| process.is_ready()) else {
+        let new = crate::dataflow::accept_param_value(description, &param, value, self.life.folder())?;
+        let Some(active) = member.active.as_ref().filter(|active| active.is_ready()) else {
             return Err(format!("node '{id}' is not running at the moment"));
         };
-        if let Some(earlier) = self.settings.iter().find(|setting| setting.process == process.id) {
+        if let Some(earlier) = self.settings.iter().find(|setting| setting.instance == active.id) {
             return Err(format!(
                 "node '{id}' has not answered 'set {id}.{}={}' yet: its process is stopped or hangs",
                 earlier.param, earlier.new
@@ -66,11 +67,11 @@ impl Launcher {
         let mut params = member.node.params.clone();
         let old = params.insert(param.clone(), new.clone()).unwrap_or(Value::Null);
         self.n_sets += 1;
-        process.tell(&Command::Set { id: self.n_sets, params: params.clone() });
+        self.life.site.tell(active.id, &Command::Set { id: self.n_sets, params: params.clone() });
         self.settings.push(PendingSet {
             id: self.n_sets,
             idx,
-            process: process.id,
+            instance: active.id,
             param,
             old,
             new,
@@ -87,17 +88,17 @@ impl Launcher {
             return;
         };
         let PendingSet { idx, param, old, new, params, since, reply, .. } = self.settings.remove(at);
-        let node = self.members[idx].node.id.clone();
+        let node = self.life.members[idx].node.id.clone();
         let answer = match error {
             Some(error) => Reply::refusal(format!("node '{node}' does not take it: {error}")),
             None => {
-                self.members[idx].node.params = params;
+                self.life.members[idx].node.params = params;
                 let from = from_seq.map_or("the first sample".into(), |seq| format!("sample {seq}"));
                 let late = match &reply {
                     Some(_) => String::new(),
                     None => format!(", {:.1} s after it was asked", since.elapsed().as_secs_f64()),
                 };
-                self.say(&format!("blindgrasp: {node}.{param}: {old} -> {new}, from {from} on{late}"));
+                self.life.site.say(&format!("blindgrasp: {node}.{param}: {old} -> {new}, from {from} on{late}"));
                 Reply::Set { old, new, from_seq }
             }
         };
@@ -110,10 +111,10 @@ impl Launcher {
     pub(super) fn look_at_settings(&mut self) {
         let mut settings = std::mem::take(&mut self.settings);
         settings.retain_mut(|setting| {
-            let member = &mut self.members[setting.idx];
+            let member = &self.life.members[setting.idx];
             let mut is_there = false;
-            for process in member.processes() {
-                is_there |= process.id == setting.process && process.is_running();
+            for instance in member.instances() {
+                is_there |= instance.id == setting.instance && instance.is_running();
             }
             let id = &member.node.id;
             let message = if !is_there {
@@ -160,7 +161,7 @@ mod tests {
         assert_eq!(launcher.status().nodes[0].params["votes"], 3);
         let (asked, next) = set(5);
         launcher.on_ask(asked);
-        launcher.turn(Duration::ZERO).expect("supervised");
+        launcher.turn().expect("supervised");
         let next = format!("{:?}", next.try_recv());
         assert!(next.contains("has not answered 'set stub.votes=9' yet"), "{next}");
         std::fs::write(&goes_on, "").expect("written");

@@ -1,15 +1,14 @@
 //! Finds operators that have died or hang, starts them again, and gives up operators that keep dying.
 
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use crate::control::{GraphState, NodeState};
 use crate::dataflow::{Restart, RestartPolicy};
-use crate::launcher::{LaunchError, Launcher, Member, RUNNING};
+use crate::launcher::RUNNING;
+use crate::launcher::lifecycle::{LOG_DRAIN_LIMIT, Lifecycle, Member, Surroundings};
 use crate::log::log_tail;
 use blindgrasp_operator::cursors::SampleId;
 use blindgrasp_operator::namespace::SHARED_MEMORY_FOLDER;
-use blindgrasp_operator::wiring::Command;
-use blindgrasp_operator::{monotonic_nanos, namespace};
 
 /// The longest pause before a restart, unless the file asks for a longer one.
 const MAX_BACKOFF: Duration = Duration::from_secs(10);
@@ -21,8 +20,8 @@ const ROOM_PAUSE: Duration = Duration::from_millis(500);
 pub(crate) const QUARANTINED: &str = "quarantined";
 const MAX_QUARANTINE: usize = 64;
 
-/// A launcher that has not looked for longer than this was stopped.
-const AWAY_NANOS: u64 = 1_000_000_000;
+/// What a process says right before it ends is heard within this time.
+const HEARING: Duration = Duration::from_millis(1);
 
 /// The pause before a restart, after so many others. A writer fails that waits for a reader for as long as `wait_limit`: the next
 /// instance must be there sooner.
@@ -34,168 +33,133 @@ fn pause_before(restart: &Restart, n_before: u32, wait_limit: Duration) -> Durat
     (first * (1 << (n_before - 1).min(10))).min(MAX_BACKOFF.min(wait_limit / 2).max(first))
 }
 
-impl Launcher {
-    /// Finds dead and hung processes, and starts them again if they may be, of all nodes but those that the launcher waits for.
-    /// To be called in every loop that waits.
-    pub(super) fn supervise_others(&mut self, awaited: &[usize]) {
-        self.kill_hung();
+impl<S: Surroundings> Lifecycle<S> {
+    /// Finds dead processes, and starts them again if they may be, of all nodes but those whose old instance stands by.
+    pub(super) fn supervise(&mut self) {
+        if !self.ending.supervises() {
+            return;
+        }
         for idx in 0..self.members.len() {
-            let outcome = if awaited.contains(&idx) { Ok(()) } else { self.supervise_node(idx) };
-            if let Err(error) = outcome {
-                self.failure.get_or_insert(error);
+            if self.is_launching {
+                self.supervise_launch(idx);
+            } else {
+                self.supervise_node(idx);
             }
         }
-        self.restart_due();
-    }
-
-    /// Restarts the nodes whose time has come, once the deaths of all nodes of their processes are known.
-    fn restart_due(&mut self) {
+        // Once the deaths of all nodes of their processes are known.
         for idx in 0..self.members.len() {
-            let is_due = self.members[idx].restart_at.is_some_and(|at| at <= Instant::now());
-            if is_due && self.together(idx).iter().all(|idx| self.members[*idx].active.is_none()) {
+            let is_due = self.members[idx].restart_at.is_some_and(|at| at <= self.now);
+            if is_due
+                && !self.is_in_swap(idx)
+                && self.together(idx).iter().all(|idx| self.members[*idx].active.is_none())
+            {
                 self.restart(idx);
             }
         }
     }
 
-    fn supervise_node(&mut self, idx: usize) -> Result<(), LaunchError> {
+    /// An operator that ends or fails before all are ready ends the launch.
+    fn supervise_launch(&mut self, idx: usize) {
+        let has_begun = self.members.iter().all(|member| member.active.as_ref().is_some_and(|each| each.pid.is_some()));
         let member = &mut self.members[idx];
-        if let Some(process) = member.active.as_mut()
+        if has_begun
             && !member.is_over
+            && member.active.as_ref().is_some_and(|active| active.is_heard(self.now, LOG_DRAIN_LIMIT))
         {
-            process.look();
-            if process.is_stopped_by_somebody_else() {
-                process.kill();
-                process.finding = Some("was stopped from outside (SIGTERM)".into());
-            }
-            let has_done_its_work = process.is_asked && process.is_done;
-            if !process.is_running() && !has_done_its_work {
-                if self.is_on_probation(idx) {
-                    // Its predecessor comes back.
-                    return Ok(());
-                }
-                self.on_death(idx)?;
-            }
-            self.look_at_state(idx);
+            member.is_over = true;
+            let error = self.failed(idx, true);
+            self.site.fail(error);
         }
-        Ok(())
+    }
+
+    fn supervise_node(&mut self, idx: usize) {
+        let member = &self.members[idx];
+        let Some(active) = &member.active else { return };
+        if member.is_over {
+            return;
+        }
+        if active.is_stopped && !active.is_asked {
+            self.kill(active.id, Some("was stopped from outside (SIGTERM)".into()));
+        }
+        let Some(active) = &self.members[idx].active else { return };
+        let has_done_its_work = active.is_asked && active.is_done;
+        if !active.is_running() && !has_done_its_work {
+            // A process that ends by itself with an error says why.
+            let limit = if active.has_exited_in_error() { LOG_DRAIN_LIMIT } else { HEARING };
+            if !active.is_heard(self.now, limit) || self.is_in_swap(idx) {
+                return;
+            }
+            self.on_death(idx);
+        }
+        self.look_at_state(idx);
     }
 
     /// Follows a process that is ready, is done, or is not ready in time.
     fn look_at_state(&mut self, idx: usize) {
         let member = &mut self.members[idx];
-        let Some(process) = &mut member.active else {
-            return;
-        };
-        if process.is_ready()
+        let Some(active) = &member.active else { return };
+        if active.is_ready()
             && let Some(died) = member.died.take()
         {
             member.state = NodeState::Running;
             member.waits_for_room = false;
-            let line = format!(
-                "blindgrasp: node '{}' is back after {:.1} ms",
-                member.node.id,
-                died.elapsed().as_secs_f64() * 1e3
-            );
-            self.say(&line);
-        } else if !process.is_ready() && process.started.elapsed() > self.options.startup_limit {
-            process.kill();
+            let millis = (self.now - died).as_secs_f64() * 1e3;
+            self.site.say(&format!("blindgrasp: node '{}' is back after {millis:.1} ms", member.node.id));
+        } else if active.pid.is_some() && !active.is_ready() && self.now - active.started > self.options.startup_limit {
+            let id = active.id;
             let limit = self.options.startup_limit.as_secs_f64();
-            process.finding = Some(format!("was not ready within {limit} s of its restart"));
-        } else if process.is_done && member.state == NodeState::Running {
+            self.kill(id, Some(format!("was not ready within {limit} s of its restart")));
+        } else if active.is_done && member.state == NodeState::Running {
             member.state = NodeState::Done;
         }
     }
 
-    /// Kills processes without a heartbeat for too long.
-    pub(super) fn kill_hung(&mut self) {
-        let now = monotonic_nanos();
-        // A launcher that was stopped itself, or suspended with the machine, does not know which processes were.
-        let was_away = now.saturating_sub(std::mem::replace(&mut self.last_look_nanos, now)) > AWAY_NANOS;
-        for idx in 0..self.members.len() {
-            self.kill_if_hung(idx, was_away);
-        }
-    }
-
-    fn kill_if_hung(&mut self, idx: usize, was_away: bool) {
-        let member = &mut self.members[idx];
-        let Some(limit_millis) = member.node.heartbeat_millis else {
-            return;
-        };
-        let leaving = self.leaving.iter_mut().filter(|leaving| leaving.idx == idx);
-        for process in member.processes().chain(leaving.map(|leaving| &mut leaving.process)) {
-            let last = self.cursors.instance(process.instance_slot).last_beat_nanos();
-            if last == 0 || !process.is_running() {
-                continue;
-            }
-            if was_away {
-                self.cursors.instance(process.instance_slot).beat(monotonic_nanos());
-            } else if monotonic_nanos().saturating_sub(last) > limit_millis * 1_000_000 {
-                let what = format!("had no heartbeat for {limit_millis} ms and was killed");
-                process.kill();
-                process.finding = Some(what);
-            }
-        }
-    }
-
     /// Restarts a node whose active process has ended, if it may be.
-    fn on_death(&mut self, idx: usize) -> Result<(), LaunchError> {
-        // Its last lines may still be on their way. A process that ends by itself with an error says why.
-        self.listen(Duration::from_millis(1));
-        let exit = self.members[idx].active.as_ref().and_then(|process| process.exit);
-        if exit.is_some_and(|exit| exit.code().is_some_and(|code| code != 0)) {
-            self.drain_logs(|launcher| launcher.members[idx].active.as_ref());
-        }
+    fn on_death(&mut self, idx: usize) {
         let is_stopping = self.state == GraphState::Stopping;
         let member = &mut self.members[idx];
-        let Some(process) = &member.active else {
-            return Ok(());
-        };
-        let restart = member.node.restart;
-        let (id, ending) = (member.node.id.clone(), process.ending());
-        let ended_of_its_own = process.failure().is_none() && process.exit.is_some_and(|status| status.success());
-        if is_stopping && process.is_asked && process.has_ended_well() {
+        let policy = member.node.restart.policy;
+        let Some(active) = &mut member.active else { return };
+        let ending = active.ending();
+        if is_stopping && active.is_asked && active.has_ended_well() {
             // It ended at SIGTERM at once, which is accepted.
-            member.active.iter_mut().for_each(|process| process.is_done = true);
-            return Ok(());
+            active.is_done = true;
+            return;
         }
-        let may_restart = match restart.policy {
+        let may_restart = match policy {
             RestartPolicy::Never => false,
-            RestartPolicy::OnFailure => !ended_of_its_own || process.is_asked,
+            RestartPolicy::OnFailure => !active.has_succeeded() || active.is_asked,
             RestartPolicy::Always => true,
         };
         if !may_restart {
-            member.is_over = true;
-            self.stop_waiting_for(idx);
-            return Err(self.failed(&id, true));
+            let error = self.failed(idx, true);
+            self.site.fail(error);
         }
-        let (log, is_for_want_of_room) = (process.last_lines(), process.has_died_of_full_memory());
-        if is_stopping && !self.has_gone {
-            // The launch has failed: the graph will not run.
+        // If the launch has failed, the graph will not run.
+        if !may_restart || (is_stopping && !self.has_gone) {
+            let member = &mut self.members[idx];
             member.is_over = true;
-            self.stop_waiting_for(idx);
-            return Ok(());
+            return self.site.stop_waiting_for(&member.node, true);
         }
-        if is_for_want_of_room {
+        let member = &mut self.members[idx];
+        let Some(active) = member.active.take() else { return };
+        let log = self.site.last_lines(active.id);
+        self.site.forget(active.id);
+        if active.has_died_of_full_memory() {
             // Neither the node nor the sample is to blame.
-            member.active = None;
-            self.wait_for_room(idx, &ending, &format!("there is room in {SHARED_MEMORY_FOLDER}"));
-            return Ok(());
+            return self.wait_for_room(idx, &ending, &format!("there is room in {SHARED_MEMORY_FOLDER}"));
         }
         // A failure that comes twice at the start for the same reason, such as a file that cannot be read, comes again.
-        let start_failure = if process.is_ready() { None } else { process.failure() };
+        let start_failure = if active.is_ready() { None } else { active.failure };
         let is_permanent = start_failure.is_some() && start_failure == member.start_failure;
         member.start_failure = start_failure;
         if is_permanent {
-            member.active = None;
-            self.give_up(idx, format!("node '{id}' {ending}, twice in a row at its start: it is given up"));
-            return Ok(());
+            let id = &member.node.id;
+            let message = format!("node '{id}' {ending}, twice in a row at its start: it is given up");
+            return self.give_up(idx, message);
         }
-        let sample = self.cursors.instance(process.instance_slot).sample();
-        member.active = None;
-        self.quarantine(idx, sample);
+        self.quarantine(idx, active.death.and_then(|death| death.sample));
         self.start_again(idx, &ending, &log);
-        Ok(())
     }
 
     /// Leaves a sample without an answer if a node has died on it twice in a row: it would die on it again, and take all that
@@ -219,16 +183,16 @@ impl Launcher {
             "blindgrasp: node '{}' has died twice on sample {}: the sample is left without an answer",
             member.node.id, sample.seq
         );
-        self.say(&line);
+        self.site.say(&line);
     }
 
     /// Plans the restart of a node without a process, or gives it up after too many.
     pub(super) fn start_again(&mut self, idx: usize, ending: &str, log: &[String]) {
-        let now = Instant::now();
+        let now = self.now;
         let member = &mut self.members[idx];
         let (id, restart) = (member.node.id.clone(), member.node.restart);
         let window = Duration::from_millis(restart.within_millis);
-        member.restarts.retain(|at| now.duration_since(*at) <= window);
+        member.restarts.retain(|at| now - *at <= window);
         if member.restarts.len() >= restart.limit as usize {
             let message = format!(
                 "node '{id}' {ending}, {} times within {} s: it is given up{}",
@@ -244,118 +208,98 @@ impl Launcher {
         member.waits_for_room = false;
         member.died.get_or_insert(now);
         member.restart_at = Some(now + backoff);
-        self.say(&format!("blindgrasp: node '{id}' {ending}; it is started again"));
+        self.site.say(&format!("blindgrasp: node '{id}' {ending}; it is started again"));
     }
 
     /// Plans the restart of a node without a process for when the machine has room for it, `when`. It does not count among its
     /// restarts.
     fn wait_for_room(&mut self, idx: usize, ending: &str, when: &str) {
-        let now = Instant::now();
+        let now = self.now;
         let member = &mut self.members[idx];
         member.state = NodeState::Restarting;
         member.died.get_or_insert(now);
         member.restart_at = Some(now + ROOM_PAUSE);
         if !std::mem::replace(&mut member.waits_for_room, true) {
             let line = format!("blindgrasp: node '{}' {ending}; it is started again when {when}", member.node.id);
-            self.say(&line);
+            self.site.say(&line);
         }
         // The memory of the dead process is free then.
-        self.reap();
+        self.site.reap();
     }
 
     fn restart(&mut self, idx: usize) {
         let idxs = self.together(idx);
-        let waits_for_room = idxs.iter().any(|idx| self.members[*idx].waits_for_room);
-        if waits_for_room && namespace::is_full() {
-            let again = Instant::now() + ROOM_PAUSE;
+        if idxs.iter().any(|idx| self.members[*idx].waits_for_room) && self.site.is_memory_full() {
             // Dead processes may hold memory that could not be freed before.
-            self.reap();
-            return idxs.into_iter().for_each(|idx| self.members[idx].restart_at = Some(again));
+            self.site.reap();
+            for idx in idxs {
+                self.members[idx].restart_at = Some(self.now + ROOM_PAUSE);
+            }
+            return;
         }
-        // While it begins, nobody starts it once more.
-        idxs.iter().for_each(|idx| self.members[*idx].restart_at = None);
-        let failure = self.spawn_active(idx).err().map(|error| (error.is_shortage(), anyhow::Error::from(error)));
-        if let Some((true, error)) = &failure {
-            let (ending, when) = (format!("is missing ({error:#})"), "the machine can start processes again");
-            return idxs.into_iter().for_each(|idx| self.wait_for_room(idx, &ending, when));
+        self.start_active(idx);
+        self.site.reap();
+    }
+
+    /// The processes of these nodes could not be started again.
+    pub(super) fn on_failed_restart(&mut self, idxs: &[usize], is_shortage: bool, message: &str) {
+        for idx in idxs {
+            if is_shortage {
+                let ending = format!("is missing ({message})");
+                self.wait_for_room(*idx, &ending, "the machine can start processes again");
+            } else {
+                self.count_restart(*idx);
+            }
         }
+        if !is_shortage {
+            for idx in idxs {
+                self.start_again(*idx, message, &[]);
+            }
+        }
+    }
+
+    pub(super) fn count_restart(&mut self, idx: usize) {
         // A source fails because a node behind it waits for room.
         let is_counted = !self.members.iter().any(|member| member.waits_for_room);
-        for idx in &idxs {
-            let member = &mut self.members[*idx];
-            if is_counted {
-                member.restarts.push_back(Instant::now());
-            }
-            member.n_restarts += 1;
+        let member = &mut self.members[idx];
+        if is_counted {
+            member.restarts.push_back(self.now);
         }
-        if let Some((_, error)) = failure {
-            let message = format!("{error:#}");
-            return idxs.into_iter().for_each(|idx| self.start_again(idx, &message, &[]));
-        }
-        for idx in idxs {
-            let member = &mut self.members[idx];
-            let is_link = member.node.is_link();
-            let Some(process) = &mut member.active else {
-                continue;
-            };
-            if is_link || self.has_gone {
-                process.tell(&Command::Go);
-            }
-            if is_link {
-                // It must know what its predecessor knew.
-                self.link.ended_nodes.iter().for_each(|node| process.tell(&Command::NodeEnded { node: node.clone() }));
-            }
-        }
-        self.reap();
-    }
-
-    /// Frees the iceoryx2 resources of dead processes, on a thread because it takes milliseconds.
-    pub(super) fn reap(&self) {
-        let domain = self.plan.domain().clone();
-        // Without a thread, they are freed the next time.
-        let _ = std::thread::Builder::new().spawn(move || namespace::clean_dead_nodes(&domain));
-    }
-
-    /// Tells the writers of a node's inputs that it reads no more.
-    fn stop_waiting_for(&self, idx: usize) {
-        for slot in self.plan.input_slots(&self.members[idx].node.id) {
-            self.cursors.input(slot).give_up(true);
-        }
+        member.n_restarts += 1;
     }
 
     /// Gives up a node, and those that share its process; the graph goes on without them.
     pub(super) fn give_up(&mut self, idx: usize, message: String) {
         for idx in self.together(idx) {
-            self.stop_waiting_for(idx);
             let member = &mut self.members[idx];
+            self.site.stop_waiting_for(&member.node, true);
             member.state = NodeState::Failed;
             member.restart_at = None;
-            member.active.take_if(|process| {
-                process.look();
-                !process.is_running()
-            });
+            if let Some(active) = member.active.take_if(|active| !active.is_running()) {
+                self.site.forget(active.id);
+            }
         }
-        self.state = GraphState::Degraded;
-        self.say(&format!(
+        if self.state != GraphState::Stopping {
+            self.state = GraphState::Degraded;
+        }
+        self.site.say(&format!(
             "blindgrasp: graph '{}' is degraded: {message}\nblindgrasp: nothing behind it is decided until it is swapped",
             self.name
         ));
-        self.service.has_status(&format!("degraded: {}", message.lines().next().unwrap_or_default()));
+        self.site.has_status(&format!("degraded: {}", message.lines().next().unwrap_or_default()));
         self.degraded = Some(message);
-        self.reap();
+        self.site.reap();
     }
 
     /// Takes back a node that was given up, after a swap has given it a new process.
     pub(super) fn heal(&mut self, idx: usize) {
-        let slots: Vec<usize> = self.plan.input_slots(&self.members[idx].node.id).collect();
-        for slot in slots {
-            self.cursors.input(slot).give_up(false);
-        }
-        self.members[idx].is_over = false;
-        self.members[idx].restarts.clear();
+        let member = &mut self.members[idx];
+        self.site.stop_waiting_for(&member.node, false);
+        member.is_over = false;
+        member.restarts.clear();
         if !self.members.iter().any(Member::is_given_up) && self.state == GraphState::Degraded {
             self.state = GraphState::Running;
-            self.service.has_status(RUNNING);
+            self.site.has_status(RUNNING);
             self.degraded = None;
         }
     }

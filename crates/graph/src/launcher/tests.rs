@@ -4,12 +4,10 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, sync_channel};
-use std::time::Duration;
 
-use crate::control::{Reply, Request};
+use crate::control::{NodeState, Reply, Request, SwapRequest};
 use crate::dataflow::pins::Pins;
 use crate::dataflow::{Graph, Node, ParamKind, ProcessOptions, Restart};
-use crate::launcher::process::ProcessOutput;
 use crate::launcher::server::Ask;
 use crate::launcher::{LaunchOptions, Launcher};
 use crate::plan::{Plan, PlanOptions};
@@ -41,22 +39,8 @@ pub(super) fn launched(name: &str, script: &str, argument: &str) -> Launched {
     let name = format!("{name}-{}", std::process::id());
     let script =
         format!("exec 3> /dev/fd/$BLINDGRASP_REPORTS; echo '{{\"report\":\"ready\"}}' >&3; read -r go; {script}");
-    let votes = ParamKind::Integer { min: None, max: None };
-    let node = Node {
-        id: STUB.into(),
-        program: "/bin/sh".into(),
-        args: vec!["-c".into(), script, argument.into()],
-        description: OperatorDescription::new(STUB, "A stub").live_param("votes", votes, Some("3".into()), "Votes"),
-        inputs: Vec::new(),
-        params: [("votes".to_owned(), 3.into())].into_iter().collect(),
-        restart: Restart::default(),
-        heartbeat_millis: None,
-        sandbox: Sandbox::Off,
-        memory_max_mib: None,
-        process: ProcessOptions::default(),
-        sha256: Pins::default(),
-        machine: None,
-    };
+    let mut node = stub(STUB);
+    node.args = vec!["-c".into(), script, argument.into()];
     let graph = Graph {
         name: name.clone(),
         file: "/dataflow.yaml".into(),
@@ -77,6 +61,26 @@ pub(super) fn launched(name: &str, script: &str, argument: &str) -> Launched {
     Launched { launcher, _namespace: namespace, _logs: logs }
 }
 
+/// A node whose program is the shell.
+pub(super) fn stub(id: &str) -> Node {
+    let votes = ParamKind::Integer { min: None, max: None };
+    Node {
+        id: id.into(),
+        program: "/bin/sh".into(),
+        args: Vec::new(),
+        description: OperatorDescription::new(id, "A stub").live_param("votes", votes, Some("3".into()), "Votes"),
+        inputs: Vec::new(),
+        params: [("votes".to_owned(), 3.into())].into_iter().collect(),
+        restart: Restart::default(),
+        heartbeat_millis: None,
+        sandbox: Sandbox::Off,
+        memory_max_mib: None,
+        process: ProcessOptions::default(),
+        sha256: Pins::default(),
+        machine: None,
+    }
+}
+
 /// A request of a client, and its replies.
 pub(super) fn ask(request: Request) -> (Box<Ask>, Receiver<Reply>) {
     let (reply, replies) = sync_channel(8);
@@ -86,7 +90,7 @@ pub(super) fn ask(request: Request) -> (Box<Ask>, Receiver<Reply>) {
 /// Lets the launcher work until a condition holds.
 pub(super) fn work_until(launcher: &mut Launcher, mut is_so: impl FnMut(&Launcher) -> bool) {
     while !is_so(launcher) {
-        launcher.turn(Duration::from_millis(5)).expect("supervised");
+        launcher.turn().expect("supervised");
     }
 }
 
@@ -95,17 +99,68 @@ pub(super) fn work_until(launcher: &mut Launcher, mut is_so: impl FnMut(&Launche
 fn counts_of_a_state_are_those_of_the_active_process() {
     let mut graph = launched("counts", "exec cat > /dev/null", "");
     let launcher = &mut graph.launcher;
-    let id = launcher.members[0].active.as_ref().expect("a process").id;
+    let id = launcher.life.members[0].active.as_ref().expect("an instance").id;
     let shown_after = |launcher: &mut Launcher, kept: u64| {
         let counts = BTreeMap::from([("outcomes/kept".to_owned(), kept)]);
-        launcher.on_output(id, ProcessOutput::Report(Report::Counts { counts, in_all: true }));
+        launcher.on_output(id, Report::Counts { counts, in_all: true });
         launcher.status().nodes[0].counts.get("outcomes/kept").copied()
     };
     for (kept, shown) in [(0, None), (304, Some(304)), (7, Some(7)), (0, Some(0))] {
         assert_eq!(shown_after(launcher, kept), shown);
     }
     // A replacement that stands by counts for itself alone.
-    let member = &mut launcher.members[0];
+    let member = &mut launcher.life.members[0];
     std::mem::swap(&mut member.active, &mut member.standby);
     assert_eq!(shown_after(launcher, 12), Some(0));
+}
+
+/// The same rules with real processes, each in its order; `lifecycle_tests` has them in all others.
+#[test]
+fn a_process_is_started_again_swapped_taken_back_and_ended() {
+    let script = r#"trap 'echo "{\"report\":\"drained\"}" >&3' TERM
+        while read -r line; do
+            case "$line" in
+                *hand_over*) echo '{"report":"handed_over","has_sent_all":true}' >&3 ;;
+                *take_over*) echo '{"report":"took_over"}' >&3 ;;
+            esac
+        done"#;
+    let mut graph = launched("whole-life", script, "");
+    let launcher = &mut graph.launcher;
+    let swap = |votes: u32, probation_millis: u64| {
+        ask(Request::Swap(SwapRequest {
+            nodes: vec![STUB.into()],
+            program: None,
+            args: None,
+            set: BTreeMap::from([("votes".into(), votes.to_string())]),
+            folder: "/".into(),
+            shadow_limit_millis: 0,
+            ready_limit_millis: 60_000,
+            probation_millis,
+            allow_mismatch: false,
+        }))
+    };
+    let kill = |pid: Option<u32>| {
+        let pid = rustix::process::Pid::from_raw(pid.expect("a process") as i32).expect("a number");
+        rustix::process::kill_process(pid, rustix::process::Signal::KILL).expect("killed");
+    };
+    let stub = |launcher: &Launcher| launcher.status().nodes.remove(0);
+    kill(stub(launcher).pid);
+    work_until(launcher, |launcher| stub(launcher).n_restarts == 1 && stub(launcher).state == NodeState::Running);
+    let (asked, replies) = swap(5, 0);
+    launcher.on_ask(asked);
+    work_until(launcher, |launcher| stub(launcher).n_swaps == 1);
+    assert!(matches!(replies.try_iter().last(), Some(Reply::Swapped { .. })));
+    assert_eq!(stub(launcher).params["votes"], 5);
+    let old = stub(launcher).pid;
+    let (asked, replies) = swap(7, 600_000);
+    launcher.on_ask(asked);
+    let on_probation = |reply: &Reply| matches!(reply, Reply::Progress { message } if message.contains("on probation"));
+    work_until(launcher, |_| replies.try_iter().any(|reply| on_probation(&reply)));
+    assert_eq!(stub(launcher).standby_pid, old);
+    kill(stub(launcher).pid);
+    work_until(launcher, |launcher| launcher.life.swap.is_none());
+    assert!(matches!(replies.try_iter().last(), Some(Reply::Error { rolled_back: true, .. })));
+    assert_eq!((stub(launcher).pid, &stub(launcher).params["votes"]), (old, &5.into()));
+    launcher.drain(&|| false).expect("drained");
+    launcher.quit(&|| false).expect("ended");
 }
