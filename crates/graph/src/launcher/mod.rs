@@ -60,7 +60,7 @@ use crate::plan::{N_ATTACHED, Plan};
 use blindgrasp_operator::cursors::{CursorsError, SharedCursors};
 use blindgrasp_operator::diagnostics::LinePrinter;
 use blindgrasp_operator::monotonic_nanos;
-use crate::control::{DecisionStatus, EdgeStatus, GraphStatus, Iceoryx2Config, NodeStatus, Reply, Request};
+use blindgrasp_operator::namespace::{self, FILE_PREFIX, NamespaceError};
 use blindgrasp_operator::wiring::{Clock, Command, LogEntry, LogLevel, Report, WaitMode};
 use rustix::io::Errno;
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
@@ -641,7 +641,8 @@ impl Launcher {
             message: if life.members.iter().any(Member::is_given_up) { life.degraded.clone() } else { None },
             uptime_secs: self.started.elapsed().as_secs_f64(),
             log_folder: self.log_folder.path().into(),
-use crate::control::{DecisionStatus, EdgeStatus, GraphStatus, Iceoryx2Config, NodeStatus, Reply, Request};
+            iceoryx2: Iceoryx2Config { root_path: life.site.plan.domain().ports(), prefix: FILE_PREFIX.into() },
+            nodes: life.members.iter().map(|member| self.node_status(member)).collect(),
             edges: self.edges(),
             decisions: self.decisions.lock().unwrap_or_else(PoisonError::into_inner).clone(),
             link: life.link.status().cloned(),
