@@ -278,7 +278,12 @@ impl Arbiter {
         let (n_kept, n_dropped) = (promise.n_kept, promise.n_dropped);
         let [kept_since_change, dropped_since_change] = promise.since_change();
         let ArbiterOptions { promised_drops, lifts_per_object, .. } = *self.arbiter.options();
-        let drops_at_most_ppm = (1e6 * promise.drops_at_most(lifts_per_object)).ceil() as u64;
+        // Before an outcome there is nothing to tell.
+        let (mut drops_at_most_ppm, mut told_lifts_per_object) = (0, 0);
+        if kept_since_change + dropped_since_change > 0 {
+            drops_at_most_ppm = (1e6 * promise.drops_at_most(lifts_per_object)).ceil() as u64;
+            told_lifts_per_object = u64::from(lifts_per_object);
+        }
         if promise.is_withdrawn() && !self.reported.0.is_withdrawn() {
             let promised = 100.0 * promised_drops;
             tracing::warn!(
@@ -299,7 +304,7 @@ impl Arbiter {
             (OUTCOME_COUNTS[0].into(), kept_since_change),
             (OUTCOME_COUNTS[1].into(), dropped_since_change),
             (OUTCOME_COUNTS[2].into(), drops_at_most_ppm),
-            (OUTCOME_COUNTS[3].into(), lifts_per_object.into()),
+            (OUTCOME_COUNTS[3].into(), told_lifts_per_object),
             ("lifts/kept".into(), self.ended.n_kept + n_kept),
             ("lifts/dropped".into(), self.ended.n_dropped + n_dropped),
             ("lifts/unreported".into(), state.n_unreported()),
