@@ -367,7 +367,7 @@ class LiftDecision(Message):
 
 
 class GraspTruth(Message):
-    TYPE_NAME = "blindgrasp/GraspTruth/1"
+    TYPE_NAME = "blindgrasp/GraspTruth/2"
     Head = GraspTruthHead
     Item = ctypes.c_uint8
 

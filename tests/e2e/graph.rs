@@ -27,7 +27,7 @@ flowchart LR
   n1 -->|"contacts<br/>ContactSet/7"| n2
   n2 -->|"feature<br/>GraspFeature/4"| n3
   n3 -->|"prediction<br/>Prediction/4"| n4
-  n0 -->|"truth<br/>GraspTruth/1"| n5
+  n0 -->|"truth<br/>GraspTruth/2"| n5
   n4 -->|"decision<br/>LiftDecision/3"| n5
 "#;
     assert_eq!(drawn(&["--format", "mermaid"]), expected);
@@ -125,7 +125,7 @@ flowchart LR
   n1 -.->|"contacts<br/>ContactSet/7<br/>Zenoh"| n2
   n2 -->|"feature<br/>GraspFeature/4"| n3
   n3 -.->|"prediction<br/>Prediction/4<br/>Zenoh"| n4
-  n0 -->|"truth<br/>GraspTruth/1"| n5
+  n0 -->|"truth<br/>GraspTruth/2"| n5
   n4 -->|"decision<br/>LiftDecision/3"| n5
   linkStyle 1 stroke:#7a4fb5,color:#7a4fb5
   linkStyle 3 stroke:#7a4fb5,color:#7a4fb5

@@ -379,13 +379,13 @@ fn a_node_that_cannot_connect_to_a_neighbour_at_once_connects_later() {
     assert_whole(&ended, undisturbed(), n_restarts, "nodes without descriptors");
 }
 
-/// The runs need about fifty descriptors.
+/// The runs need about seventy descriptors: all programs begin at once.
 #[test]
 fn a_run_with_few_descriptors_loses_nothing_or_is_refused_in_words() {
     let folder = tempfile::tempdir().expect("a folder");
     let flow = dataflow_with(folder.path(), &[]);
     let (mut n_whole, mut n_refused) = (0, 0);
-    for n_files in (16..=56).step_by(8) {
+    for n_files in (16..=72).step_by(14) {
         let mut limited = Command::new("sh");
         let exec = format!("ulimit -n {n_files} && exec \"$0\" \"$@\"");
         limited.args(["-c", &exec, program()]).current_dir(project());

@@ -445,7 +445,7 @@ fn a_graph_in_the_background_whose_source_cannot_listen_has_not_started() {
     let (name, flow) = (unique_name(), live_dataflow(folder.path(), &address));
     let output = run(&["run", "--detach", "--name", &name, flow.to_str().expect("UTF-8")], 1);
     let said = text(&output.stderr);
-    assert!(said.contains("did not start") && said.contains("give each graph an address"), "{said}");
+    assert!(said.contains("did not start") && said.contains("give each source an address"), "{said}");
     assert_nothing_left(&name);
 }
 

@@ -5,7 +5,7 @@ use crate::MAX_NAME_BYTES;
 message! {
     /// The label of a simulated or labelled grasp. The header's sequence counts labels.
     #[derive(serde::Serialize)]
-    pub struct GraspTruth = "blindgrasp/GraspTruth/1" on "/truth" {
+    pub struct GraspTruth = "blindgrasp/GraspTruth/2" on "/truth" {
         pub grasp_id: u64,
         /// Epsilon quality: the least wrench that breaks the grasp; -1 without force closure, NaN if it was not
         /// computed.

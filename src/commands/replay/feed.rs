@@ -12,7 +12,7 @@ use blindgrasp_graph::plan::Port;
 use blindgrasp_graph::run::observed_topics;
 use blindgrasp_messages::{ContactSet, GraspFeature, Prediction, TactileFrame};
 use blindgrasp_operator::diagnostics::print_diagnostic;
-use blindgrasp_recording::{Reach, RecordingReader};
+use blindgrasp_recording::{Reach, RecordingReader, TOPICS_FOR_VIEWERS};
 use blindgrasp_replay::playback::{Next, Playback};
 use blindgrasp_replay::played::Played;
 use blindgrasp_replay::rewrite::{FedEdge, Origin, PLAYER, Player, Replaced};
@@ -163,10 +163,12 @@ fn find_topic(reader: &RecordingReader, expected: &str, type_name: &str) -> anyh
     match of_type.as_slice() {
         _ if of_type.iter().any(|topic| *topic == expected) => Ok(expected.into()),
         [only] => Ok((*only).clone()),
-        [] => bail!(
-            "it holds no {expected} to replay; it has {}",
-            if topics.is_empty() { "nothing".into() } else { topics.keys().cloned().collect::<Vec<_>>().join(", ") }
-        ),
+        [] => {
+            let own = topics.into_keys().filter(|topic| !TOPICS_FOR_VIEWERS.contains(&topic.as_str()));
+            let own: Vec<String> = own.collect();
+            let found = if own.is_empty() { "nothing".into() } else { own.join(", ") };
+            bail!("it holds no {expected} to replay; it has {found}")
+        }
         _ => bail!(
             "it holds no {expected} to replay, and several topics of that type: {}; it was recorded from another graph",
             of_type.into_iter().cloned().collect::<Vec<_>>().join(", ")

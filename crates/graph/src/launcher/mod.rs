@@ -198,6 +198,8 @@ pub struct Launcher {
     started: Instant,
     slow_nodes: SlowNodes,
     wake_policy: WakePolicy,
+    /// It writes as long as it lives.
+    _logs: LogWriter,
 }
 
 /// Raises the limit of descriptors of this process and of those that it starts as far as it may. Connections of strangers to
@@ -245,6 +247,7 @@ impl Launcher {
             swapping: BTreeMap::new(),
             last_look_nanos: monotonic_nanos(),
         };
+        let audit_log = logs.log_if_written(AUDIT);
         let mut launcher = Launcher {
             life: Lifecycle::new(graph, name, options, hands),
             server: None,
@@ -261,10 +264,11 @@ impl Launcher {
             started: Instant::now(),
             slow_nodes: SlowNodes::new(),
             wake_policy: WakePolicy::new(),
+            _logs: logs,
         };
-        let audit = logs.log_if_written(AUDIT);
         let pins = graph.nodes.iter().map(|node| (node.id.clone(), node.sha256.clone())).collect();
-        let server = server::serve(control, pins, &launcher.life.site.events, audit).map_err(LaunchError::Control)?;
+        let server =
+            server::serve(control, pins, &launcher.life.site.events, audit_log).map_err(LaunchError::Control)?;
         launcher.server = Some(server);
         launcher.life.launch();
         while launcher.pids().len() < graph.nodes.len() {
