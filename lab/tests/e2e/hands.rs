@@ -77,7 +77,7 @@ fn planned_lifts_are_felt_more_often_than_blind_ones() {
         let lift =
             ["simulate", "--hand", "parallel-gripper", "--label", "lift", "--protocol", approach, "--grasps", "20"];
         let report = json_of(&[&lift[..], &["--stable-fraction", "natural", "--json", "--out", &out]].concat());
-        let frames = text(&run(&["export", &out, "--format", "jsonl"], 0).stdout).to_owned();
+        let frames = text(&run(&["export", &out], 0).stdout).to_owned();
         let settled = frames.lines().filter(|line| line.contains("\"phase\":\"settled\""));
         let felt: std::collections::BTreeSet<String> = settled
             .filter_map(|line| {
