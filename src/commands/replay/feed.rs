@@ -164,8 +164,8 @@ fn find_topic(reader: &RecordingReader, expected: &str, type_name: &str) -> anyh
         _ if of_type.iter().any(|topic| *topic == expected) => Ok(expected.into()),
         [only] => Ok((*only).clone()),
         [] => {
-            let own = topics.into_keys().filter(|topic| !TOPICS_FOR_VIEWERS.contains(&topic.as_str()));
-            let own: Vec<String> = own.collect();
+            let own = topics.keys().filter(|topic| !TOPICS_FOR_VIEWERS.contains(&topic.as_str()));
+            let own: Vec<String> = own.cloned().collect();
             let found = if own.is_empty() { "nothing".into() } else { own.join(", ") };
             bail!("it holds no {expected} to replay; it has {found}")
         }
