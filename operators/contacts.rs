@@ -216,10 +216,9 @@ impl Stage for FindContacts {
             && Phase::from_code(head.phase).is_ok_and(|phase| !phase.is_over())
             && (is_at_rest || summary.fault != Fault::NoContact)
             && let Some(why) = explain_fault(&self.hand, &self.finder, &summary, parts.as_ref())
+            && let Some(line) = self.faults.line(head.grasp_id, &why, now_nanos)
         {
-            if let Some(line) = self.faults.line(head.grasp_id, &why, now_nanos) {
-                print_diagnostic(&line);
-            }
+            print_diagnostic(&line);
         }
         let phase = Phase::from_code(head.phase).ok().filter(|phase| !phase.is_over());
         if let (Some(watch), Some(parts), Some(phase)) = (&mut self.watch, &parts, phase)

@@ -175,7 +175,7 @@ fn what_cannot_be_is_refused_on_both_ends() {
 fn schema_numbers_tell_types_apart_and_stay_as_they_are() {
     // A change here means: machines with the version before refuse each other. A type's name changes then, too.
     let found = MESSAGE_TYPES.map(|type_name| schema_id(type_name).expect("it can cross"));
-    assert_eq!(found, [2761762759, 2685038448, 3215498353, 1254893153, 2891020063, 1162676088, 412222848]);
+    assert_eq!(found, [2761762759, 2685038448, 3215498353, 1254893153, 2891020063, 312201359, 412222848]);
     let others = [GraspScene::TYPE_NAME, "blindgrasp/TactileFrame/2", ""];
     assert!(others.iter().all(|type_name| schema_id(type_name).is_none()));
 }
