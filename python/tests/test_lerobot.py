@@ -154,7 +154,8 @@ class LeRobot(unittest.TestCase):
         for version in ("v2.0", "v2.1", "v3.0"):
             with self.subTest(version):
                 done = self.converted(self.dataset(version), "--at", "1.4", "--day", "session", "--overwrite")
-                self.assertEqual(done.stderr, "")
+                # A slow machine tells how far it is.
+                self.assertRegex(done.stderr, r"\A(\d+ of 12 episodes\n)*\Z")
                 self.assertIn("12 grasps of 12 episodes", done.stdout)
                 grasps = self.imported(done)
                 self.assertEqual(len(grasps), N_EPISODES)
