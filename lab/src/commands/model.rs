@@ -6,7 +6,7 @@ use anyhow::Context;
 use clap::{Args, Subcommand};
 use serde_json::json;
 
-use super::train::{probe_lines, threshold_line};
+use super::train::{is_of_the_papers_label, probe_lines, threshold_line};
 use super::{Outcome, check_new, completions, number_in, percent, print_line, print_text};
 use blindgrasp_grasps::dataset::{hand_of, label_line};
 use blindgrasp_learning::training::adapt;
@@ -171,7 +171,8 @@ pub(super) fn print_model(model: &Model, drop_costs: Option<f64>) -> std::io::Re
         print_line(&line)?;
     }
     if let Some(policy) = model.training.policies.last() {
-        for line in curve_lines(policy, own_threshold(model, policy), drop_costs) {
+        let kept = if is_of_the_papers_label(&model.training) { "stable" } else { "kept" };
+        for line in curve_lines(policy, kept, own_threshold(model, policy), drop_costs) {
             print_line(&line)?;
         }
     }
@@ -188,7 +189,7 @@ fn own_threshold(model: &Model, policy: &PolicySummary) -> f64 {
 }
 
 /// The thresholds of the look that decides, for people, with the model's own and the cheapest for this price of a drop.
-fn curve_lines(policy: &PolicySummary, own: f64, drop_costs: Option<f64>) -> Vec<String> {
+fn curve_lines(policy: &PolicySummary, kept: &str, own: f64, drop_costs: Option<f64>) -> Vec<String> {
     let look = policy.look.replace('_', "-");
     if policy.curve.is_empty() {
         return vec![format!(
@@ -203,7 +204,7 @@ fn curve_lines(policy: &PolicySummary, own: f64, drop_costs: Option<f64>) -> Vec
     let mut lines = vec![format!(
         "{:<27} {:>8} {:>9} {:>16} {:>9} {:>20}",
         format!("threshold when {look}"),
-        "kept",
+        kept,
         "recall",
         "attempts a lift",
         "given up",
@@ -398,7 +399,7 @@ mod tests {
             promise: None,
             curve: vec![point(0.51239, 0.9, 2.0), point(0.933, 0.98, 6.0)],
         };
-        let marked = |policy: &PolicySummary, drop_costs| curve_lines(policy, 0.933, drop_costs);
+        let marked = |policy: &PolicySummary, drop_costs| curve_lines(policy, "kept", 0.933, drop_costs);
         let lines = marked(&policy, None);
         assert_eq!((lines.len(), lines.iter().filter(|line| line.contains("cheapest")).count()), (3, 0));
         assert!(lines[2].contains("98.0 %") && lines[2].ends_with("8.0 %  the model's own"), "{lines:?}");

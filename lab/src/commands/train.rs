@@ -173,7 +173,7 @@ pub(super) fn probe_lines(model: &Model) -> Vec<String> {
 
 /// Whether a grasp was learned to be stable by epsilon and volume. A model names no label if its recordings are simulated with this
 /// one, or if they are a robot's.
-fn is_of_the_papers_label(training: &TrainingSummary) -> bool {
+pub(super) fn is_of_the_papers_label(training: &TrainingSummary) -> bool {
     let is_simulated = training.made_by.iter().any(|made_by| made_by.starts_with("simulation of "));
     training.labels.contains_key(&Label::WrenchSpace) || (training.labels.is_empty() && is_simulated)
 }
