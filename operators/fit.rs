@@ -8,6 +8,7 @@ use std::rc::Rc;
 use blindgrasp_graph::control::GraphStatus;
 use blindgrasp_graph::dataflow::Graph;
 use blindgrasp_graph::link::config::REVOKED_FILE;
+use blindgrasp_messages::Phase;
 use blindgrasp_stages::classifier::Classifier;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::label::Label;
@@ -230,12 +231,28 @@ impl<'a> Check<'a> {
     fn bound(&mut self, arbiter: &Part, classifier: &Part, model: &Model) {
         let name = arbiter.params.get("probe").and_then(Value::as_str).unwrap_or("none");
         let best = if name == "test_lift" { None } else { most_drops(model, "test_lifted") };
-        let own = match name {
-            "squeeze" => most_drops(model, "squeezed"),
-            "test_lift" => most_drops(model, "test_lifted"),
-            _ => most_drops(model, "settled"),
+        let look = match name {
+            "squeeze" => Phase::Squeezed,
+            "test_lift" => Phase::TestLifted,
+            _ => Phase::Settled,
         };
-        let promised = arbiter.params.get("promised_drops").and_then(Value::as_f64);
+        let own = most_drops(model, look.as_str());
+        let number = |name: &str| arbiter.params.get(name).and_then(Value::as_f64);
+        let promised = number("promised_drops");
+        if let Some(least) = number("min_probability_stable")
+            && least > 0.0
+            && let Some(of_look) = model.look(look)
+            && least < of_look.threshold_probability
+        {
+            let message = format!(
+                "min_probability_stable is {least}, below the threshold of the model of node '{}', {:.4}: the model's bound on drops \
+                 does not hold",
+                classifier.node, of_look.threshold_probability
+            );
+            let help = "expected 0, which takes the model's own threshold".into();
+            self.fit.warnings.push(Misfit { kind: MisfitKind::Bound, node: arbiter.node.clone(), message, help });
+            return;
+        }
         let is_weaker = best.is_some_and(|best| own.is_none_or(|own| own > best));
         let is_unbacked = promised.is_some_and(|promised| promised < own.unwrap_or(1.0));
         if !is_weaker && !is_unbacked {
@@ -442,6 +459,10 @@ mod tests {
                 assert!(format!("{message}: {help}").contains(expected), "{message}: {help}");
             }
         }
+        let mut parts = gate(HAND, LIFTS, "test_lift");
+        parts[4].params.insert("min_probability_stable".into(), 0.3.into());
+        let warnings = check_fit(&parts).warnings;
+        assert!(warnings.len() == 1 && warnings[0].message.contains("is 0.3, below the threshold"), "{warnings:?}");
         // The graph of a live hand promises what its model does, in tenths of a percent.
         let model = Model::load(Path::new(&project(LIFTS))).expect("a model");
         let own = (1000.0 * most_drops(&model, "test_lifted").expect("a bound")).ceil() / 1000.0;

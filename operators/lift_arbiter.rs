@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use blindgrasp_messages::{
-    Action, Header, LiftDecision, LiftDecisionHead, Message, Prediction, PredictionHead, Recorded,
+    Header, LiftDecision, LiftDecisionHead, Message, Prediction, PredictionHead, Reason, Recorded,
 };
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::{Operator, parse_params};
@@ -261,7 +261,8 @@ impl Stage for Arbiter {
 impl Arbiter {
     /// Keeps the outcomes under a promise, if the arbiter has another one now.
     fn has_replaced(&mut self, before: &PromiseMonitor) {
-        if self.arbiter.state().promise() != before {
+        let now = self.arbiter.state().promise();
+        if now.n_kept + now.n_dropped < before.n_kept + before.n_dropped {
             self.ended.n_kept += before.n_kept;
             self.ended.n_dropped += before.n_dropped;
             self.ended.n_withdrawn += u64::from(before.is_withdrawn());
@@ -317,7 +318,7 @@ impl Arbiter {
     fn publish(&mut self, answers: &mut Answers<LiftDecision>) {
         for decision in self.decided.drain(..) {
             let why = self.arbiter.explain(decision.grasp_id).join("; ");
-            if decision.action == Action::Hold && !why.is_empty() {
+            if matches!(decision.reason, Reason::Stale | Reason::NoAgreement) && !why.is_empty() {
                 tracing::warn!("grasp {} is held, {}: {why}", decision.grasp_id, decision.reason.as_str());
             }
             // By a recording's clock nothing expires.

@@ -1,9 +1,9 @@
 //! Finds glitches of cells, readings of one frame that no contact makes, and leaves them out if the hand's layout asks for it.
 //!
 //! With `median_filter`, a cell reads the median of its last three readings in a phase of a grasp; of the first two, the smaller
-//! one. So a spike of one frame is no contact, and a contact that one frame misses is one. A contact comes and goes a frame
-//! later. A phase begins with the reading itself, because frames of another phase are of another posture. While the arm lifts,
-//! readings count as they are: its watch should not wait.
+//! one. So a spike of one frame is no contact, and a cell that one frame misses still feels. A contact comes and goes a frame later.
+//! Some readings count as they are: the first one of a phase, because frames of another phase are of another posture; a frame
+//! without any active cell, because the object may have gone; and all while the arm lifts, because its watch should not wait.
 //!
 //! Pure: no clock, no I/O. [`GlitchFilter`] is the state.
 
@@ -72,7 +72,8 @@ impl GlitchFilter {
             }
         }
         self.note_spikes(thresholds, cells_newtons);
-        let is_filtered = hand.median_filter && self.n_before > 0 && phase != Phase::Lifting;
+        let feels = cells_newtons.iter().zip(thresholds).any(|(now, threshold)| now > threshold);
+        let is_filtered = hand.median_filter && self.n_before > 0 && phase != Phase::Lifting && feels;
         if is_filtered {
             self.steady.clear();
             for (cell, now) in cells_newtons.iter().enumerate() {
@@ -151,10 +152,10 @@ mod tests {
         hand
     }
 
-    /// A frame in which one cell alone reads so many newtons.
+    /// A frame in which one cell reads so many newtons, and another one 1 N.
     fn frame(hand: &Hand, newtons: f64) -> Vec<f64> {
         let mut cells = vec![0.01; hand.n_cells()];
-        cells[7] = newtons;
+        (cells[7], cells[30]) = (newtons, 1.0);
         cells
     }
 
@@ -168,6 +169,10 @@ mod tests {
             let steady = filter.steady(&hand, (1, 2), Phase::Settled, &frame(&hand, reading))[7];
             assert_eq!(steady, expected, "{reading}");
         }
+        // Where no cell feels any more, the object may have gone.
+        filter.steady(&hand, (1, 2), Phase::Settled, &frame(&hand, 2.0));
+        let nothing = vec![0.0; hand.n_cells()];
+        assert_eq!(filter.steady(&hand, (1, 2), Phase::Settled, &nothing), nothing);
         // A phase, a grasp and a lift begin with the reading itself.
         for (grasp, phase) in [(2, Phase::Squeezing), (3, Phase::Squeezing), (3, Phase::Lifting), (3, Phase::Lifting)] {
             assert_eq!(filter.steady(&hand, (1, grasp), phase, &frame(&hand, 4.0))[7], 4.0);

@@ -171,8 +171,10 @@ impl Judge {
         // A grasp may be held when the next one begins.
         let found = if is_of_last_frame { &self.found } else { &self.found_before };
         let mut why = self.explain_reason(decision, found, is_of_last_frame);
-        if matches!(decision.reason, Reason::Unstable | Reason::NoAgreement | Reason::OutOfDistribution)
-            && decision.grasp_id == found.grasp_id
+        if matches!(
+            decision.reason,
+            Reason::Unstable | Reason::NoAgreement | Reason::OutOfDistribution | Reason::NoContact
+        ) && decision.grasp_id == found.grasp_id
         {
             why.extend(found.flicker.clone());
         }

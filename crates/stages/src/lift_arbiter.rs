@@ -408,7 +408,9 @@ impl LiftArbiter {
         if self.state.options.promised_drops != options.promised_drops {
             self.state.promise = PromiseMonitor::default();
         }
-        if self.state.options.lifts_per_object != options.lifts_per_object {
+        // Outcomes under another rule of what is lifted say nothing for this one.
+        let rule = |of: &ArbiterOptions| (of.lifts_per_object, of.min_probability_stable, of.votes, of.probe);
+        if rule(&self.state.options) != rule(&options) {
             self.state.promise.begin_anew();
         }
         if self.state.options != options {

@@ -35,15 +35,17 @@ pub struct PromiseMonitor {
 }
 
 /// Outcomes in groups of as many consecutive lifts as an object may have. Lifts of one object end alike, so each group counts once,
-/// with the share of its lifts that dropped the object.
+/// with the share of its lifts that dropped the object. Two neighbours may have lifts of one object, and every second group has
+/// none in common with the one before: those are two sequences.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 struct LiftGroups {
     n_kept: u64,
     n_dropped: u64,
     /// Lifts and drops of the group that is not full.
     open: [u32; 2],
-    /// The number of full groups by the number of their drops.
-    full: BTreeMap<u32, u64>,
+    n_full: u64,
+    /// The number of full groups of each sequence by the number of their drops.
+    full: [BTreeMap<u32, u64>; 2],
 }
 
 impl LiftGroups {
@@ -53,14 +55,22 @@ impl LiftGroups {
         *n_lifts += 1;
         *n_dropped += u32::from(is_dropped);
         if *n_lifts >= lifts_per_object {
-            *self.full.entry(*n_dropped).or_default() += 1;
+            // Groups of one lift have nothing in common.
+            let sequence = if lifts_per_object == 1 { 0 } else { self.n_full as usize % 2 };
+            *self.full[sequence].entry(*n_dropped).or_default() += 1;
+            self.n_full += 1;
             self.open = [0, 0];
         }
     }
 
-    /// The drops of each full group as a share, and the number of such groups.
-    fn shares(&self, lifts_per_object: u32) -> Vec<(f64, u64)> {
-        self.full.iter().map(|(n_dropped, n)| (f64::from(*n_dropped) / f64::from(lifts_per_object), *n)).collect()
+    /// For each sequence, the drops of each full group as a share, and the number of such groups.
+    fn sequences(&self, lifts_per_object: u32) -> Vec<Vec<(f64, u64)>> {
+        let mut sequences = Vec::new();
+        for full in &self.full[..if lifts_per_object == 1 { 1 } else { 2 }] {
+            let share = |n_dropped: u32| f64::from(n_dropped) / f64::from(lifts_per_object);
+            sequences.push(full.iter().map(|(n_dropped, n)| (share(*n_dropped), *n)).collect());
+        }
+        sequences
     }
 }
 
@@ -99,7 +109,9 @@ impl PromiseMonitor {
     /// The largest share of the lifts that may drop, given the outcomes since the readings changed, as [`drops_at_most`]. No object
     /// is lifted more than `lifts_per_object` times in a row, the number that [`PromiseMonitor::observe`] was given.
     pub fn drops_at_most(&self, lifts_per_object: u32) -> f64 {
-        bound_of(&self.since_change.shares(lifts_per_object))
+        let sequences = self.since_change.sequences(lifts_per_object);
+        let bounds = sequences.iter().map(|groups| bound_of(groups, sequences.len()));
+        bounds.fold(1.0, f64::min)
     }
 
     /// Whether the outcomes have once spoken against the promise: a warning.
@@ -155,11 +167,12 @@ const PARTS: [f64; 6] = [0.0, 0.2, 0.35, 0.5, 0.65, 0.8];
 /// more, the capital of all together is expected to grow by nothing, so it is seldom ever 20 times as large (Ville's inequality).
 /// Shares where it is are ruled out.
 pub fn drops_at_most(n_kept: u64, n_dropped: u64) -> f64 {
-    bound_of(&[(0.0, n_kept), (1.0, n_dropped)])
+    bound_of(&[(0.0, n_kept), (1.0, n_dropped)], 1)
 }
 
-/// The bound of [`drops_at_most`] for groups of lifts: the share of drops in a group, and the number of such groups.
-fn bound_of(groups: &[(f64, u64)]) -> f64 {
+/// The bound of [`drops_at_most`] for groups of lifts: the share of drops in a group, and the number of such groups. They are one of
+/// `n_sequences`, each of which may be wrong with an equal part of the probability.
+fn bound_of(groups: &[(f64, u64)], n_sequences: usize) -> f64 {
     let n: u64 = groups.iter().map(|(_, n)| n).sum();
     if n == 0 {
         return 1.0;
@@ -168,13 +181,13 @@ fn bound_of(groups: &[(f64, u64)]) -> f64 {
     let (mut possible, mut ruled_out) = (n_dropped / n as f64, 1.0);
     for _ in 0..50 {
         let middle = f64::midpoint(possible, ruled_out);
-        if middle < 1.0 && is_ruled_out(middle, groups) { ruled_out = middle } else { possible = middle }
+        if middle < 1.0 && is_ruled_out(middle, groups, n_sequences) { ruled_out = middle } else { possible = middle }
     }
     ruled_out
 }
 
 /// Whether the groups of lifts rule out that this share of the lifts drops.
-fn is_ruled_out(share: f64, groups: &[(f64, u64)]) -> bool {
+fn is_ruled_out(share: f64, groups: &[(f64, u64)], n_sequences: usize) -> bool {
     let mut capital = 0.0;
     for part in PARTS {
         let of_kept = (1.0 - part * share) / (1.0 - share);
@@ -186,11 +199,13 @@ fn is_ruled_out(share: f64, groups: &[(f64, u64)]) -> bool {
         }
         capital += libm::exp(log_capital);
     }
-    capital >= PARTS.len() as f64 / (1.0 - CONFIDENCE)
+    capital >= (PARTS.len() * n_sequences) as f64 / (1.0 - CONFIDENCE)
 }
 
 #[cfg(test)]
 mod tests {
+    use std::ops::RangeInclusive;
+
     use rand::{RngExt, SeedableRng};
     use rand_chacha::ChaCha8Rng;
 
@@ -276,19 +291,31 @@ mod tests {
     }
 
     /// The number of robots, of `n_robots`, whose bound was ever below the true share of drops within 1,000 lifts. Each object is
-    /// lifted `in_a_row` times, and each of its lifts drops it or none does.
-    fn n_broken(random: &mut ChaCha8Rng, share: f64, in_a_row: u32, lifts_per_object: u32, n_robots: u32) -> u32 {
+    /// lifted as often in a row as `in_a_row` says, the first one perhaps less often, and each of its lifts drops it or none does.
+    fn n_broken(
+        random: &mut ChaCha8Rng,
+        share: f64,
+        in_a_row: RangeInclusive<u32>,
+        lifts_per_object: u32,
+        n_robots: u32,
+    ) -> u32 {
         let mut n_broken = 0;
         for _ in 0..n_robots {
             let mut groups = LiftGroups::default();
-            let mut is_bad = false;
+            let mut is_bad = random.random::<f64>() < share;
+            let mut n_left = random.random_range(1..=*in_a_row.end());
             let mut is_broken = false;
-            for lift in 0..1000 {
-                if lift % in_a_row == 0 {
+            for _ in 0..1000 {
+                if n_left == 0 {
                     is_bad = random.random::<f64>() < share;
+                    n_left = random.random_range(in_a_row.clone());
                 }
+                n_left -= 1;
                 groups.observe(is_bad, lifts_per_object);
-                is_broken |= groups.open == [0, 0] && is_ruled_out(share, &groups.shares(lifts_per_object));
+                if groups.open == [0, 0] {
+                    let sequences = groups.sequences(lifts_per_object);
+                    is_broken |= sequences.iter().any(|groups| is_ruled_out(share, groups, sequences.len()));
+                }
             }
             n_broken += u32::from(is_broken);
         }
@@ -298,15 +325,16 @@ mod tests {
     #[test]
     fn the_bound_after_every_lift_holds_for_95_of_100_robots() {
         let mut random = ChaCha8Rng::seed_from_u64(11);
-        for (in_a_row, lifts_per_object) in [(1, 1), (1, 5), (5, 5), (10, 10)] {
+        for (in_a_row, lifts_per_object) in [(1..=1, 1), (1..=1, 5), (2..=2, 2), (5..=5, 5), (3..=5, 5), (10..=10, 10)]
+        {
             let mut n_all_broken = 0;
             for (share, n_robots) in [(0.02, 400), (0.1, 400), (0.5, 200)] {
-                n_all_broken += n_broken(&mut random, share, in_a_row, lifts_per_object, n_robots);
+                n_all_broken += n_broken(&mut random, share, in_a_row.clone(), lifts_per_object, n_robots);
             }
-            assert!(n_all_broken <= 50, "{n_all_broken} of 1000 robots, {in_a_row} lifts in a row");
+            assert!(n_all_broken <= 50, "{n_all_broken} of 1000 robots, {in_a_row:?} lifts in a row");
         }
         // As lifts of other objects, five in a row of each would promise too much.
-        assert!(n_broken(&mut random, 0.1, 5, 1, 100) > 20);
+        assert!(n_broken(&mut random, 0.1, 5..=5, 1, 100) > 20);
     }
 
     #[test]
@@ -315,10 +343,11 @@ mod tests {
         assert_eq!(monitor.drops_at_most(5), 1.0);
         // 100 objects that are kept five times, and then two that drop once of five times.
         (0..500).for_each(|_| monitor.observe(false, 0.1, 5));
-        assert!((monitor.drops_at_most(5) - drops_at_most(100, 0)).abs() < 1e-9);
+        let of_two = |n_kept, n_dropped| bound_of(&[(0.0, n_kept), (1.0, n_dropped)], 2);
+        assert!((monitor.drops_at_most(5) - of_two(50, 0)).abs() < 1e-9);
         (0..10).for_each(|nth| monitor.observe(nth % 5 == 0, 0.1, 5));
         let bound = monitor.drops_at_most(5);
-        assert!(drops_at_most(102, 0) < bound && bound < drops_at_most(101, 1), "{bound}");
+        assert!(of_two(51, 0) < bound && bound < of_two(50, 1), "{bound}");
         // The lifts of a group that is not full are counted, and say nothing yet.
         monitor.observe(true, 0.1, 5);
         assert_eq!((monitor.since_change(), monitor.drops_at_most(5)), ([508, 3], bound));

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use anyhow::Context;
+use anyhow::{Context, bail};
 use clap::{Args, Subcommand};
 use serde_json::json;
 
@@ -159,6 +159,9 @@ fn show(arguments: &ShowArguments) -> anyhow::Result<Outcome> {
         return Ok(Outcome::Done);
     }
     print_model(&model, arguments.drop_costs)?;
+    if arguments.drop_costs.is_some() && model.training.policies.last().is_none_or(|policy| policy.curve.is_empty()) {
+        bail!("--drop-costs: the model has no curve of thresholds to choose from");
+    }
     Ok(Outcome::Done)
 }
 
@@ -229,8 +232,11 @@ fn curve_lines(policy: &PolicySummary, kept: &str, own: f64, drop_costs: Option<
         lines.push(line);
     }
     if let Some(point) = cheapest {
-        // It is rounded down, so that it does not pass the grasps at the threshold; 0 would be the model's own.
-        let threshold = ((1e4 * point.threshold_probability).floor() / 1e4).max(1e-4);
+        // It is rounded down, so that it does not pass the grasps at the threshold; 0 is the model's own.
+        let mut threshold = ((1e4 * point.threshold_probability).floor() / 1e4).max(1e-4);
+        if point.threshold_probability == own {
+            threshold = 0.0;
+        }
         lines.push(format!("to choose it: blindgrasp set lift_arbiter.min_probability_stable={threshold}"));
     }
     lines
@@ -407,7 +413,9 @@ mod tests {
         let lines = marked(&policy, Some(10.0));
         assert!(lines[1].contains("cheapest") && lines[3].ends_with("min_probability_stable=0.5123"), "{lines:?}");
         // 13.3 and 8.2.
-        assert!(marked(&policy, Some(100.0))[2].ends_with("the model's own  the cheapest for this price of a drop"));
+        let lines = marked(&policy, Some(100.0));
+        assert!(lines[2].ends_with("the model's own  the cheapest for this price of a drop"), "{lines:?}");
+        assert!(lines[3].ends_with("min_probability_stable=0"), "{lines:?}");
         policy.curve.clear();
         assert!(marked(&policy, Some(10.0))[0].starts_with("no curve of thresholds when test-lifted"));
     }

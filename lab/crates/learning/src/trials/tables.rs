@@ -105,7 +105,11 @@ impl TrialsReport {
             let numbers = (n_shards, report.n_trials, report.max_attempts, report.seed, report.late.is_some());
             (numbers, &report.objects, &report.model, &report.options)
         });
-        ours == theirs
+        // A shard without an attempt does not tell which ways were run.
+        let [our_ways, their_ways] =
+            [self, other].map(|report| (!report.records_with_gate.is_empty(), !report.records_without_gate.is_empty()));
+        let tells_ways = our_ways != (false, false) && their_ways != (false, false);
+        ours == theirs && (!tells_ways || our_ways == their_ways)
     }
 
     /// Counts; an empty list of records is a way that was not run.
@@ -443,6 +447,7 @@ pub(super) mod tests {
         let text = |report: &TrialsReport| tables(report).iter().flat_map(Table::to_text).collect::<Vec<_>>();
         assert_eq!(text(&merged), text(&whole));
         let other = TrialsReport { seed: 2, ..shard(0) };
+        let one_way = TrialsReport { records_without_gate: Vec::new(), ..shard(0) };
         let stopped = TrialsReport { end: "stopped".into(), ..shard(0) };
         for (shards, says) in [
             (vec![], "found none"),
@@ -450,6 +455,7 @@ pub(super) mod tests {
             (vec![shard(1)], "0/2 is missing"),
             (vec![shard(1), shard(1)], "1/2 is there twice"),
             (vec![shard(1), other], "0/2 is of another run"),
+            (vec![shard(1), one_way], "0/2 is of another run"),
             (vec![shard(1), stopped], "0/2 was stopped"),
         ] {
             let refused = TrialsReport::merge(shards).expect_err(says);
