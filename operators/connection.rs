@@ -10,10 +10,10 @@ use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::param::ParamKind;
 use serde::Deserialize;
 
-/// The port of Zenoh.
+/// The endpoint of a router of Zenoh on this machine.
 const ROUTER: &str = "tcp/localhost:7447";
 /// The name of this program's files in a folder of keys.
-const KEY_NAME: &str = "ros2";
+const KEY_NAME: &str = "zenoh";
 
 /// A connection: the router on this machine by default.
 #[derive(Debug, Deserialize, Clone, Default)]
@@ -22,7 +22,7 @@ pub struct ConnectionParams {
     pub connect: Option<String>,
     /// An endpoint at which others connect.
     pub listen: Option<String>,
-    /// A folder with `ca.pem`, `ros2.pem` and `ros2.key.pem`.
+    /// A folder with `ca.pem`, `zenoh.pem` and `zenoh.key.pem`.
     pub keys: Option<PathBuf>,
     /// With keys: common names of certificates, with commas between them.
     pub from: Option<String>,
@@ -36,12 +36,12 @@ pub fn with_connection_params(description: OperatorDescription) -> OperatorDescr
         .optional_param(
             "keys",
             ParamKind::Path { must_exist: true },
-            "A folder with ca.pem, ros2.pem and ros2.key.pem, for endpoints tls/HOST:PORT",
+            "A folder with ca.pem, zenoh.pem and zenoh.key.pem, for endpoints tls/HOST:PORT",
         )
         .optional_param(
             "from",
             ParamKind::String {},
-            "With keys: the common names of the certificates at the other end that take part, like ros2,arm; ros2 by default, and \
+            "With keys: the common names of the certificates at the other end that take part, like zenoh,arm; zenoh by default, and \
              with connect also @router",
         )
 }
@@ -80,7 +80,7 @@ impl ConnectionParams {
         };
         if names.iter().any(String::is_empty) {
             return Err(NetworkError::Keys(
-                "'from' has an empty name: expected names of certificates, like ros2,arm".into(),
+                "'from' has an empty name: expected names of certificates, like zenoh,arm".into(),
             ));
         }
         let network = Network { connect, listen: self.listen.iter().cloned().collect(), keys, names };
@@ -123,8 +123,8 @@ mod tests {
     fn by_default_the_names_of_ros_2_take_part_and_where_it_connects_the_routers() {
         let names = |yaml| params(&yaml).map(|network| network.names);
         let of = |names: &[&str]| Ok(names.iter().map(|name| (*name).to_owned()).collect());
-        assert_eq!(names(json!({"keys": "/k", "listen": "tls/0.0.0.0:1"})), of(&["ros2"]));
-        assert_eq!(names(json!({"keys": "/k", "connect": "tls/robot:1"})), of(&["ros2", "@router"]));
+        assert_eq!(names(json!({"keys": "/k", "listen": "tls/0.0.0.0:1"})), of(&["zenoh"]));
+        assert_eq!(names(json!({"keys": "/k", "connect": "tls/robot:1"})), of(&["zenoh", "@router"]));
         assert_eq!(names(json!({"keys": "/k", "listen": "tls/0.0.0.0:1", "from": "arm, hand"})), of(&["arm", "hand"]));
         assert_eq!(names(json!({})), of(&[]));
     }
@@ -135,9 +135,9 @@ mod tests {
             (json!({"keys": "/k"}), "keys without an endpoint that uses them"),
             (json!({"keys": "/k", "listen": "tcp/127.0.0.1:1"}), "keys without an endpoint that uses them"),
             (json!({"keys": "/k", "listen": "tls/a:1", "connect": "tls/b:1"}), "expected one of them"),
-            (json!({"keys": "/k", "listen": "tls/a:1", "from": "ros2,"}), "'from' has an empty name"),
+            (json!({"keys": "/k", "listen": "tls/a:1", "from": "zenoh,"}), "'from' has an empty name"),
             (json!({"listen": "tls/a:1"}), "is no endpoint"),
-            (json!({"from": "ros2"}), "'from' without keys"),
+            (json!({"from": "zenoh"}), "'from' without keys"),
         ] {
             let error = params(&yaml).expect_err("refused").to_string();
             assert!(error.contains(expected), "{error}");

@@ -20,10 +20,10 @@ const DECISIONS: &str = "robot/hand/decision";
 
 fn network(listen: &str, connect: &str, folder: Option<&Path>) -> Network {
     let keys = folder.map(|folder| {
-        let KeyFiles { authority, certificate, private_key } = key_files(folder, "ros2");
+        let KeyFiles { authority, certificate, private_key } = key_files(folder, "zenoh");
         Keys { authority, certificate, private_key }
     });
-    let names = if keys.is_some() { vec!["ros2".into(), "arm".into()] } else { vec![] };
+    let names = if keys.is_some() { vec!["zenoh".into(), "arm".into()] } else { vec![] };
     let some = |endpoint: &str| if endpoint.is_empty() { vec![] } else { vec![endpoint.to_owned()] };
     Network { connect: some(connect), listen: some(listen), keys, names }
 }
@@ -65,7 +65,7 @@ fn is_connected(session: &Session) -> bool {
 
 /// The machines of the tests: `arm` may take part, `laptop` may not, and the certificate of `lost` is revoked.
 fn folder_of_keys() -> tempfile::TempDir {
-    let folder = keys(&["ros2", "arm", "laptop", "lost"]);
+    let folder = keys(&["zenoh", "arm", "laptop", "lost"]);
     revoke(folder.path(), "lost", None, OffsetDateTime::now_utc()).expect("revoked");
     folder
 }
@@ -108,7 +108,7 @@ fn an_output_passes_no_decisions_of_others_on() {
         let of = |name: &str| if has_keys { tls_of(folder.path(), name) } else { json!({}) };
         // A session without access control does.
         let endpoint = free_endpoint(scheme);
-        let _open_to_all = listening(&endpoint, &of("ros2"));
+        let _open_to_all = listening(&endpoint, &of("zenoh"));
         let [arm, laptop] = ["arm", "laptop"].map(|name| client(&endpoint, &of(name)));
         says(&laptop, DECISIONS, "forged", &Heard::listen(&arm, DECISIONS));
 
@@ -117,7 +117,7 @@ fn an_output_passes_no_decisions_of_others_on() {
         let own = Heard::listen(&output, "**");
         let arm = client(&endpoint, &of("arm"));
         let arm_hears = Heard::listen(&arm, "**");
-        let forgers = ["laptop", "lost", "ros2"].map(|name| (name, client(&endpoint, &of(name))));
+        let forgers = ["laptop", "lost", "zenoh"].map(|name| (name, client(&endpoint, &of(name))));
         let forgers_hear: Vec<Heard> = forgers.iter().map(|(_, session)| Heard::listen(session, DECISIONS)).collect();
         for (name, session) in &forgers {
             wait_until(&format!("{name} is connected"), || is_connected(session));
@@ -205,7 +205,7 @@ fn a_flood_of_connections_does_not_keep_the_hands_bridge_out_for_good() {
 #[test]
 fn keys_that_protect_nothing_are_refused_by_a_check() {
     let folder = tempfile::tempdir().expect("a folder");
-    let keys = keys(&["ros2"]);
+    let keys = keys(&["zenoh"]);
     let keys = keys.path().display();
     for (source, expected) in [
         (

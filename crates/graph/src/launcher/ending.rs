@@ -97,6 +97,10 @@ impl<S: Surroundings> Lifecycle<S> {
         if (member.is_done() && is_asked) || member.is_given_up() || member.is_over {
             return true;
         }
+        // Before the sources have gone there is nothing that it could answer.
+        if !self.has_gone && member.active.as_ref().is_none_or(|active| !active.is_ready()) {
+            return true;
+        }
         if let Some(active) = &mut member.active
             && !active.is_asked
             && active.is_ready()

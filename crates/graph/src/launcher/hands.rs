@@ -97,7 +97,11 @@ impl Hands {
         id: u64,
         begun: Result<BegunProgram, LaunchError>,
     ) -> Option<Result<u32, LaunchError>> {
-        let (starts, _) = self.starting.remove(&id)?;
+        let Some((starts, _)) = self.starting.remove(&id) else {
+            // It is killed. Its end may take long, and this thread waits for nothing.
+            let _ = std::thread::Builder::new().spawn(move || drop(begun));
+            return None;
+        };
         let begun = match begun {
             Ok(begun) => begun,
             Err(error) => return Some(Err(error)),

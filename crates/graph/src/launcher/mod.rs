@@ -214,7 +214,7 @@ fn raise_descriptor_limit() {
 }
 
 impl Launcher {
-    /// Starts all processes of a graph, in its order, and answers commands on `control`.
+    /// Orders the start of all processes of a graph, and answers commands on `control`.
     ///
     /// # Errors
     /// A program cannot be started, or the socket cannot be used; processes already started are killed.
