@@ -49,20 +49,23 @@ def to_parquet(
 
     `recordings` is a recording, a folder of recordings, or several of either, of one hand. The columns are those of the
     grasp: `recording`, `hand`, `hand_id`, `model`, `day`, `epoch`, `grasp_id`, and its label, decision and outcome; then
-    `seq`, `stamp_nanos`, `phase` and `predicted` (the probability that the graph predicted of the frame); then `joint_0`,
-    …, `cell_0`, … (with `hand`, as in `Recording.to_frame`, `cell_palm_0`) and the other senses. What is not known is
-    missing. `from_table` with `grasp_column="grasp_id"` and `phase_column="phase"` reads it back.
+    `grasp` (its running number in the file), `seq`, `stamp_nanos`, `phase` and `predicted` (the probability that the
+    graph predicted of the frame); then `joint_0`, …, `cell_0`, … (with `hand`, as in `Recording.to_frame`,
+    `cell_palm_0`) and the other senses. What is not known is missing. `from_table` with `grasp_column="grasp"` and
+    `phase_column="phase"` reads it back.
 
     Raises ModuleNotFoundError without pyarrow, and ValueError if the recordings are of different hands.
     """
     pa = _pyarrow()
     data = _DataSet(recordings, hand)
-    kinds = OF_GRASP | {"seq": "uint64", "stamp_nanos": "int64", "phase": "string", "predicted": "float64"}
+    kinds = OF_GRASP | {"grasp": "int64", "seq": "uint64", "stamp_nanos": "int64", "phase": "string"}
+    kinds["predicted"] = "float64"
     names = {sense: [f"{sense}_{name}" for name in data.names(sense)] for sense in data.widths}
     kinds |= {name: "float64" for of_sense in names.values() for name in of_sense}
     schema = pa.schema([(name, pa.type_for_alias(kind)) for name, kind in kinds.items()])
 
     def tables() -> Iterator[Any]:
+        n_grasps = 0
         for recording in data.recordings:
             for grasp in recording:
                 columns: dict[str, Any] = {
@@ -70,6 +73,8 @@ def to_parquet(
                 }
                 columns |= {"seq": grasp.seq, "stamp_nanos": grasp.stamp_nanos, "phase": grasp.phase.tolist()}
                 columns["predicted"] = grasp.probability_stable
+                columns["grasp"] = [n_grasps] * len(grasp.seq)
+                n_grasps += 1
                 for sense, of_sense in names.items():
                     columns |= dict(zip(of_sense, data.rows(grasp, sense).T))
                 yield pa.table(columns, schema)

@@ -1,6 +1,7 @@
 """Tests of the node `decisions` of examples/blindgrasp_ros and of its launch file, with stand-ins for rclpy and launch."""
 
 import importlib.util
+import itertools
 import sys
 import threading
 import time
@@ -42,6 +43,12 @@ class Saying(unittest.TestCase):
         self.assertEqual((replayed.action, replayed.valid_until.sec), (Decision.LIFT, replayed.stamp.sec))
         # What to do while the arm lifts is said however late.
         self.assertEqual(node.fill(Decision(), decision("tighten"), now - 1).action, Decision.TIGHTEN)
+
+    def test_a_pause_between_two_looks_at_clocks_shortens_the_time(self):
+        nanos = itertools.count(10**9, 10**9)
+        with mock.patch.object(node, "boottime_nanos", lambda: next(nanos)), mock.patch("time.time_ns", lambda: next(nanos)):
+            said = node.fill(Decision(), decision(), MINUTE)
+        self.assertLess(said.valid_until.sec, 60)
 
 
 class Waiting(unittest.TestCase):
@@ -139,30 +146,65 @@ class Following(unittest.TestCase):
             node.follow([sys.executable, "-c", script], lines.append, has_ended)
         self.assertEqual((lines, ends), ([{"grasp": 1}] * 2, ["no graph runs"] * 2))
 
-    def test_what_is_published_without_a_graph_is_a_hold(self):
-        published = {}
+
+class Publishing(unittest.TestCase):
+    def setUp(self):
+        self.published, self.logger = {}, mock.Mock()
 
         def publisher(kind, topic, qos):
-            sent = published.setdefault(topic, [])
+            sent = self.published.setdefault(topic, [])
             return Message(publish=sent.append, get_subscription_count=lambda: topic != "unread")
 
-        logger = mock.Mock()
-        ros = Message(create_publisher=publisher, get_logger=lambda: logger)
+        ros = Message(create_publisher=publisher, get_logger=lambda: self.logger)
         modules = {name: mock.MagicMock() for name in ("rclpy", "rclpy.qos", "blindgrasp_msgs", "blindgrasp_msgs.msg", "std_msgs")}
         modules["blindgrasp_msgs.msg"].Decision = Decision
         modules["std_msgs.msg"] = types.ModuleType("std_msgs.msg")
         modules["std_msgs.msg"].String = str
-        with mock.patch.dict(sys.modules, modules):
-            publishing = node.Publishing(ros, "gate")
-            publishing.take({"decision": decision(), "valid_until_nanos": node.boottime_nanos() + MINUTE})
-            for topic in ("/words", "/unread"):
-                publishing.take({"topic": topic, "type": "std_msgs/msg/String", "cdr": "00010000"})
-            for _ in range(2):
-                publishing.take({"topic": "/others", "type": "std_msgs/msg/Other", "cdr": "00"})
-            logger.warning.assert_called_once()
-            for _ in range(2):
-                publishing.begin_anew("")
-                publishing.begin_anew("no graph of this name runs")
+        patch = mock.patch.dict(sys.modules, modules)
+        patch.start()
+        self.addCleanup(patch.stop)
+        self.publishing = node.Publishing(ros, "gate")
+
+    def test_a_lift_whose_time_is_over_is_taken_back_once(self):
+        publishing = self.publishing
+        # In a replay no LIFT is valid.
+        for until_nanos in (None, node.boottime_nanos() + MINUTE):
+            publishing.decide(decision(), until_nanos)
+            publishing.take_back()
+        with mock.patch.object(node, "boottime_nanos", lambda: until_nanos):
+            publishing.take_back()
+            publishing.take_back()
+        found = [(said.action, said.reason) for said in self.published["decision"]]
+        self.assertEqual(found, [(Decision.HOLD, "no_graph"), *[(Decision.LIFT, "stable")] * 2, (Decision.HOLD, "stale")])
+
+    def test_a_decision_is_published_before_the_next_one_is_kept(self):
+        publishing = self.publishing
+        until_nanos = node.boottime_nanos() + MINUTE
+        other = threading.Thread(target=publishing.decide, args=(decision("hold", 4), until_nanos))
+        sent = []
+
+        def publish(said):
+            if said.grasp_id == 3:
+                other.start()
+                other.join(0.05)
+            sent.append(said.grasp_id)
+
+        publishing.decision.publish = publish
+        publishing.decide(decision(), until_nanos)
+        other.join()
+        self.assertEqual(sent, [3, 4])
+
+    def test_what_is_published_without_a_graph_is_a_hold(self):
+        publishing, published, logger = self.publishing, self.published, self.logger
+        publishing.take({"decision": decision(), "valid_until_nanos": node.boottime_nanos() + MINUTE})
+        for topic in ("/words", "/unread"):
+            publishing.take({"topic": topic, "type": "std_msgs/msg/String", "cdr": "00010000"})
+        for _ in range(2):
+            publishing.take({"topic": "/others", "type": "std_msgs/msg/Other", "cdr": "00"})
+        logger.warning.assert_called_once()
+        for _ in range(2):
+            publishing.begin_anew("")
+            publishing.begin_anew("no graph of this name runs")
         # The first and the last decision of all are holds, said once.
         found = [(said.action, said.reason) for said in published["decision"]]
         self.assertEqual(found, [(Decision.HOLD, "no_graph"), (Decision.LIFT, "stable"), (Decision.HOLD, "no_graph")])
@@ -187,16 +229,32 @@ class Launch(unittest.TestCase):
         return function(Message(launch_configurations={**dict(declared), **given}))
 
     def test_the_options_start_their_nodes(self):
-        self.assertEqual(self.started(), [["node", "decisions", "live_gate"]])
+        self.assertEqual(self.started(), [["node", "decisions", "live_gate", "--namespace", "/blindgrasp"]])
         started = self.started(run="flow.yaml", graph="g", table="t.yaml", address="unix:/s", gate="lift")
         run = ["run", "blindgrasp", "run", "flow.yaml", "--name", "g"]
         hand = ["node", "hand", "t.yaml", "--address", "unix:/s"]
-        self.assertEqual(started, [["node", "decisions", "g"], run, hand, ["node", "lift_gate"]])
-        gripper = self.started(gate="gripper", controller="/c", grasps_below="0.03", parallel="true")[-1]
-        expected = ["node", "gripper_gate", "--controller", "/c", "--grasps-below", "0.03", "--wait", "3.0", "--parallel"]
-        self.assertEqual(gripper, expected)
+        decisions = ["node", "decisions", "g", "--namespace", "/blindgrasp"]
+        lift_gate = ["node", "lift_gate", "--ros-args", "--remap", "/blindgrasp/decision:=/blindgrasp/decision"]
+        self.assertEqual(started, [decisions, run, hand, lift_gate])
         with self.assertRaisesRegex(ValueError, "expected none, lift or gripper"):
             self.started(gate="arm")
+
+    def test_each_hand_has_its_graph_and_its_topics(self):
+        of_left = {"graph": "left", "table": "t.yaml", "namespace": "/left"}
+        decisions, hand, lift_gate = self.started(gate="lift", **of_left)
+        self.assertEqual(decisions[2:], ["left", "--namespace", "/left"])
+        self.assertEqual(hand[2:], ["t.yaml", "--graph", "left"])
+        self.assertEqual(lift_gate[-1], "/blindgrasp/decision:=/left/decision")
+        of_gripper = {"gate": "gripper", "controller": "/c", "grasps_below": "0.03", "name": "left_gate"}
+        for parallel in ("true", "True"):
+            gripper = self.started(parallel=parallel, **of_gripper, **of_left)[-1]
+            own = ["--controller", "/c", "--grasps-below", "0.03", "--wait", "3.0", "--name", "left_gate", "--parallel"]
+            self.assertEqual(gripper[2:], [*own, "--decisions", "/left/decision"])
+
+    def test_a_gate_of_the_gripper_that_cannot_start_is_refused(self):
+        for given in [{"grasps_below": "0.03"}, {"controller": "/c"}, {"controller": "/c", "grasps_below": "0", "grasps_above": "1"}]:
+            with self.assertRaisesRegex(ValueError, "gate:=gripper needs controller"):
+                self.started(gate="gripper", **given)
 
     def test_setup_names_nodes_that_there_are(self):
         found = {}

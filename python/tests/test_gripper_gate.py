@@ -18,19 +18,24 @@ from blindgrasp_ros import gripper_gate as example  # noqa: E402
 ACTIONS = ("hold", "lift", None, "squeeze", "test_lift", "tighten", "set_down", "go_on")
 
 
+def time_in(seconds):
+    sec, nanosec = divmod(time.time_ns() + int(seconds * 1e9), 10**9)
+    return Message(sec=sec, nanosec=nanosec)
+
+
 class Said:
     """The topic of decisions, as the test says them."""
 
     def __init__(self, decisions):
         self.decisions, self.grasp_id = decisions, 0
 
-    def say(self, action, valid_for_s=10, reason="told", grasp_id=None):
+    def say(self, action, valid_for_s=10, reason="told", grasp_id=None, ahead_s=0):
         code = ACTIONS.index(action)
         if code not in example.UNDECIDED:
             self.grasp_id += 1
-        sec, nanosec = divmod(time.time_ns() + int(valid_for_s * 1e9), 10**9)
+        stamp, valid_until = time_in(ahead_s), time_in(valid_for_s)
         grasp_id = self.grasp_id if grasp_id is None else grasp_id
-        self.decisions.take(Message(action=code, reason=reason, grasp_id=grasp_id, valid_until=Message(sec=sec, nanosec=nanosec)))
+        self.decisions.take(Message(action=code, reason=reason, grasp_id=grasp_id, stamp=stamp, valid_until=valid_until))
 
 
 class Gate(unittest.TestCase):
@@ -56,6 +61,9 @@ class Gate(unittest.TestCase):
         self.assertEqual((succeeds, why[:22]), (False, "LIFT was valid until 1"))
         self.assertNotIn("stall_timeout", why)
         self.assertEqual(self.close("test_lift", "hold"), (False, "told"))
+        succeeds, why = self.close("lift", ahead_s=1)
+        self.assertFalse(succeeds)
+        self.assertRegex(why, "stamp lies .* ms in the future: a clock was set back")
         # A hand that closed again: the hold of the later grasp counts.
         self.assertEqual(self.close("lift", "hold"), (False, "told"))
 
@@ -71,6 +79,8 @@ class Gate(unittest.TestCase):
         def move():
             self.lines.say("lift", valid_for_s=0.02)
             time.sleep(0.1)
+            # The node of decisions takes it back.
+            self.lines.say("hold", reason="stale", grasp_id=self.lines.grasp_id)
             return False, True
 
         succeeds, why = self.gate.run(0.0, move)
@@ -138,15 +148,17 @@ class Gate(unittest.TestCase):
         def take(position):
             return served["take"](Message(command=Message(position=position)))
 
-        def spin(timeout_sec):
+        def spin(node, executor):
             self.assertEqual([take(0.0), take(math.nan), take(math.inf)], ["accept", "reject", "reject"])
             arguments.parallel = True
             self.assertEqual([take([0.0]), take([]), take([0.0, math.nan])], ["accept", "reject", "reject"])
             arguments.parallel = False
-            # Nobody decides: the hand may open only.
-            served["publishers"] = 0
-            self.assertEqual([take(0.0), take(0.08)], ["reject", "accept"])
-            for action, position in [("lift", 0.0), ("hold", 0.0), (None, 0.08)]:
+            # Nobody decides, or two graphs do: the hand may open only.
+            for served["publishers"] in (0, 2):
+                self.assertEqual([take(0.0), take(0.08)], ["reject", "accept"])
+            self.assertIn("2 nodes publish /blindgrasp/decision, expected one: stop all but one", told[-1])
+            for action, position, n in [("lift", 0.0, 1), ("hold", 0.0, 1), (None, 0.08, 2), ("lift", 0.0, 2)]:
+                served["publishers"] = n
                 ends = []
                 command = Message(position=position)
                 handle = Message(
@@ -175,26 +187,27 @@ class Gate(unittest.TestCase):
 
         lines, served["publishers"] = self.lines, 1
         rclpy = types.ModuleType("rclpy")
-        logger = Message(info=lambda text: None, warning=lambda text: None)
+        told = []
+        logger = Message(info=told.append, warning=told.append)
         rclpy.init, rclpy.try_shutdown, rclpy.ok = lambda: None, lambda: None, lambda: True
-        node = Message(get_logger=lambda: logger, create_subscription=subscribe, count_publishers=lambda topic: served["publishers"])
-        rclpy.create_node = lambda name: node
+        node = mock.Mock(get_logger=lambda: logger, create_subscription=subscribe, count_publishers=lambda topic: served["publishers"])
+        rclpy.create_node, rclpy.spin = lambda name: node, spin
         action, executors = types.ModuleType("rclpy.action"), types.ModuleType("rclpy.executors")
         action.ActionClient, action.ActionServer = Client, server
-        executors.MultiThreadedExecutor = lambda num_threads: Message(add_node=lambda node: None, spin_once=spin)
+        executors.MultiThreadedExecutor = Message
         action.GoalResponse = Message(ACCEPT="accept", REJECT="reject")
         action.CancelResponse = Message(ACCEPT="accept")
         control, actions = types.ModuleType("control_msgs"), types.ModuleType("control_msgs.action")
         actions.GripperCommand, control.action = Message(Result=Message), actions
         modules = {"rclpy": rclpy, "rclpy.action": action, "rclpy.executors": executors, "rclpy.qos": mock.MagicMock()}
         modules.update({"control_msgs": control, "control_msgs.action": actions})
-        modules.update({name: mock.MagicMock() for name in ("blindgrasp_msgs", "blindgrasp_msgs.msg")})
+        modules.update({name: mock.MagicMock() for name in ("rclpy.clock", "blindgrasp_msgs", "blindgrasp_msgs.msg")})
         arguments = Message(
             parallel=False, controller="/gripper/cmd", grasps_below=0.03, grasps_above=None, wait=0.3, name="grasp_gate",
             decisions="/blindgrasp/decision")
         with mock.patch.dict(sys.modules, modules):
             example.serve(arguments)
-        self.assertEqual(served["ends"], [True, False, True])
+        self.assertEqual(served["ends"], [True, False, True, False])
         self.assertEqual((served["name"], served["controller"]), ("~/gripper_cmd", "/gripper/cmd"))
 
     def test_a_goal_of_the_parallel_gripper_may_have_no_position(self):
@@ -207,10 +220,9 @@ class LiftGate(unittest.TestCase):
     """The gate of the arm, with stand-ins for rclpy and the messages."""
 
     def test_a_grasp_is_lifted_once_in_a_run_of_the_graph(self):
-        modules = {name: mock.MagicMock() for name in ("rclpy", "rclpy.clock", "rclpy.qos", "rclpy.node", "rclpy.time")}
+        modules = {name: mock.MagicMock() for name in ("rclpy", "rclpy.qos", "rclpy.node")}
         modules.update({name: mock.MagicMock() for name in ("blindgrasp_msgs", "blindgrasp_msgs.msg")})
         modules["rclpy.node"].Node = object
-        modules["rclpy.time"].Time.from_msg = lambda nanos: Message(nanoseconds=nanos)
         kind = Message(HOLD=0, LIFT=1, TIGHTEN=5, SET_DOWN=6, GO_ON=7)
         modules["blindgrasp_msgs.msg"].Decision = kind
         with mock.patch.dict(sys.modules, modules):
@@ -218,14 +230,24 @@ class LiftGate(unittest.TestCase):
         node, logger, lifted = gate.LiftGate.__new__(gate.LiftGate), mock.Mock(), []
         node.lifted_grasp, node.lifted_until_nanos = None, 0
         node.get_logger, node.lift = lambda: logger, lambda decision: lifted.append(decision.grasp_id)
-        until = time.time_ns() + 10**10
-        decision = lambda action, after_s=0: Message(grasp_id=0, action=action, valid_until=until + int(after_s * 1e9), reason="stable")
+        node.subscription, publishers = Message(topic_name="/left/decision"), ["one"]
+        node.count_publishers = lambda topic: len(publishers)
+        decision = lambda action, after_s=0, ahead_s=0: Message(
+            grasp_id=0, action=action, stamp=time_in(ahead_s), valid_until=time_in(10 + after_s), reason="stable"
+        )
         node.on_decision(decision(kind.LIFT))
         node.on_decision(decision(kind.LIFT))
         self.assertEqual(lifted, [0])
         logger.warning.assert_called_once_with("grasp 0: LIFT came before, ignored")
         # The graph is started again, and counts from 0.
         node.on_decision(decision(kind.LIFT, after_s=3))
+        self.assertEqual(lifted, [0, 0])
+        # A clock was set back, or a second graph decides.
+        node.on_decision(decision(kind.LIFT, after_s=6, ahead_s=1))
+        self.assertRegex(logger.warning.call_args[0][0], "grasp 0: hold, the decision's stamp lies .* ms in the future")
+        publishers.append("another")
+        node.on_decision(decision(kind.LIFT, after_s=6))
+        self.assertIn("grasp 0: hold, 2 nodes publish /left/decision", logger.warning.call_args[0][0])
         self.assertEqual(lifted, [0, 0])
         node.on_decision(decision(kind.TIGHTEN))
         self.assertIn("ignored", logger.info.call_args[0][0])

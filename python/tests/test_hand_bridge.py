@@ -383,9 +383,8 @@ class Bridge(unittest.TestCase):
         rclpy = types.ModuleType("rclpy")
         rclpy.init, rclpy.try_shutdown, rclpy.ok = lambda: None, lambda: None, lambda: True
         rclpy.create_node, rclpy.spin = lambda name: self.node, lambda node, executor: spin(executor)
-        qos, clock = types.ModuleType("rclpy.qos"), types.ModuleType("rclpy.clock")
+        qos, clock = types.ModuleType("rclpy.qos"), mock.MagicMock(__name__="rclpy.clock")
         qos.qos_profile_sensor_data = qos.DurabilityPolicy = qos.QoSProfile = None
-        clock.Clock = Message
         executors, subscription = types.ModuleType("rclpy.executors"), types.ModuleType("rclpy.subscription")
         executors.SingleThreadedExecutor = lambda: executor
         subscription.Subscription = Message() if distribution == "humble" else Message(CallbackType=None)

@@ -218,6 +218,17 @@ class Recordings(Folder):
             names = ("is_stable", "object_id", "object_class")
             self.assertEqual([getattr(copied.label, name) for name in names], [getattr(grasp.label, name) for name in names])
 
+    def test_grasps_of_two_recordings_come_back_unmerged(self):
+        recording, _ = self.with_an_outcome()
+        path, again = self.folder / "frames.parquet", self.folder / "again.mcap"
+        blindgrasp.to_parquet([recording, recording], path)
+        columns = {"grasp_column": "grasp", "phase_column": "phase"}
+        frames = pd.read_parquet(path)
+        # The grasps of both recordings have the same numbers, and may follow each other.
+        frames = frames.sort_values(["grasp_id", "grasp"], kind="stable")
+        copied = blindgrasp.from_table(frames, again, hand="barrett-bh8-280", **columns)
+        self.assertEqual([len(grasp.seq) for grasp in copied], [len(grasp.seq) for grasp in blindgrasp.read(recording) for _ in range(2)])
+
     def test_recordings_of_two_hands_are_no_data_set(self):
         for recordings in (self.folder, [ORDINARY, REPOSITORY / "recordings/other-hand.mcap"]):
             with self.assertRaisesRegex(ValueError, "expected recordings of one hand, found"):

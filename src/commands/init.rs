@@ -71,7 +71,7 @@ const BRIDGES: [(&str, &[File]); 4] = [
 const LINES: File = ("bridges/line_protocol.py", include_bytes!("../../examples/bridges/line_protocol.py"));
 
 /// The packages of ROS 2: nodes and messages.
-const ROS2_FILES: [File; 25] = [
+const ROS2_FILES: [File; 27] = [
     ("blindgrasp_ros/blindgrasp_ros/line_protocol.py", LINES.1),
     ("blindgrasp_ros/launch/gate.launch.py", include_bytes!("../../examples/blindgrasp_ros/launch/gate.launch.py")),
     ("blindgrasp_ros/package.xml", include_bytes!("../../examples/blindgrasp_ros/package.xml")),
@@ -95,6 +95,7 @@ const ROS2_FILES: [File; 25] = [
         "blindgrasp_ros/blindgrasp_ros/lift_gate.py",
         include_bytes!("../../examples/blindgrasp_ros/blindgrasp_ros/lift_gate.py"),
     ),
+    ("blindgrasp_ros/blindgrasp_ros/node.py", include_bytes!("../../examples/blindgrasp_ros/blindgrasp_ros/node.py")),
     ("blindgrasp_msgs/CMakeLists.txt", include_bytes!("../../examples/blindgrasp_msgs/CMakeLists.txt")),
     ("blindgrasp_msgs/package.xml", include_bytes!("../../examples/blindgrasp_msgs/package.xml")),
     ("blindgrasp_msgs/msg/Contact.msg", include_bytes!("../../examples/blindgrasp_msgs/msg/Contact.msg")),
@@ -102,6 +103,7 @@ const ROS2_FILES: [File; 25] = [
     ("blindgrasp_msgs/msg/Decision.msg", include_bytes!("../../examples/blindgrasp_msgs/msg/Decision.msg")),
     ("blindgrasp_msgs/msg/GraspFeature.msg", include_bytes!("../../examples/blindgrasp_msgs/msg/GraspFeature.msg")),
     ("blindgrasp_msgs/msg/GraspScene.msg", include_bytes!("../../examples/blindgrasp_msgs/msg/GraspScene.msg")),
+    ("blindgrasp_msgs/msg/GraspTruth.msg", include_bytes!("../../examples/blindgrasp_msgs/msg/GraspTruth.msg")),
     ("blindgrasp_msgs/msg/Header.msg", include_bytes!("../../examples/blindgrasp_msgs/msg/Header.msg")),
     ("blindgrasp_msgs/msg/LiftDecision.msg", include_bytes!("../../examples/blindgrasp_msgs/msg/LiftDecision.msg")),
     ("blindgrasp_msgs/msg/LiftOutcome.msg", include_bytes!("../../examples/blindgrasp_msgs/msg/LiftOutcome.msg")),
@@ -191,4 +193,35 @@ fn write_new(path: &Path, content: &[u8]) -> anyhow::Result<()> {
     options.write(true).create_new(true).mode(mode);
     let mut file = options.open(path).with_context(|| format!("cannot make the file {}", path.display()))?;
     std::io::Write::write_all(&mut file, content).with_context(|| format!("cannot write {}", path.display()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_project_gets_all_files_of_the_packages_of_ros_2() {
+        let examples = Path::new(env!("CARGO_MANIFEST_DIR")).join("examples");
+        let mut folders = vec![examples.join("blindgrasp_msgs"), examples.join("blindgrasp_ros")];
+        let mut found = Vec::new();
+        while let Some(folder) = folders.pop() {
+            for entry in std::fs::read_dir(folder).expect("a folder") {
+                let path = entry.expect("an entry").path();
+                if path.is_dir() {
+                    folders.push(path);
+                } else if path.extension().is_none_or(|extension| extension != "pyc") {
+                    found.push(path);
+                }
+            }
+        }
+        found.sort();
+        let mut written = Vec::new();
+        for (name, content) in ROS2_FILES {
+            let path = examples.join(name);
+            assert!(std::fs::read(&path).expect("readable") == content, "{name} gets the content of another file");
+            written.push(path);
+        }
+        written.sort();
+        assert_eq!(written, found);
+    }
 }

@@ -13,7 +13,8 @@ use crate::common::python::python;
 use crate::common::{Graph, program, project, skipped, undisturbed, unique_name, wait_until};
 use blindgrasp_stages::hand::Hand;
 
-const N_GRASPS: u64 = 3;
+/// The last of these grasps may be lifted.
+const N_GRASPS: u64 = 5;
 /// Each frame is waited for, and the service is asked for a decision that is still valid.
 const PATIENT: [&str; 4] = ["--set", "lift_arbiter.max_gap_ms=20000", "--set", "lift_arbiter.max_age_ms=600000"];
 /// The cells and the angles of the driver have one time each, and its phases come in time.
@@ -258,7 +259,7 @@ fn robots_of_dds_are_gated_by_the_package_of_ros_2() {
     });
 }
 
-/// Frames come from topics, and decisions go to a topic. When the graph ends, no LIFT stays.
+/// Frames come from topics, and decisions go to a topic. When the graph is killed, no LIFT stays.
 fn no_lift_outlives_the_graph(built: &Path) {
     let domain = domain(0);
     let folder = tempfile::tempdir().expect("a folder");
@@ -281,6 +282,7 @@ fn no_lift_outlives_the_graph(built: &Path) {
     send_frames(&graph, domain);
     wait_until(|| graph.n_decisions() as u64 == N_GRASPS, || graph.said());
     let mut last = Value::Null;
+    assert_eq!(undisturbed()[N_GRASPS as usize - 1].0, "lift");
     for (line, (action, reason)) in graph.lines().iter().zip(&undisturbed()[..N_GRASPS as usize]) {
         assert_eq!((&line["action"], &line["reason"]), (&json!(action), &json!(reason)), "{line}");
         last = json!([line["grasp_id"], u8::from(action == "lift"), reason]);
@@ -299,13 +301,18 @@ fn no_lift_outlives_the_graph(built: &Path) {
     late.lines().until("decision", &last);
     drop(late);
 
-    graph.stop();
+    crate::common::signal(graph.pid(), rustix::process::Signal::KILL);
     heard.until("decision", &no_graph);
     heard.until("state", &json!([2]));
     let mut late = Node::start(&["-c", LISTENER], domain, Some(built));
     late.lines().until("decision", &no_graph);
     writeln!(asks, "0.1").expect("written");
     heard.until("decided", &json!([false, 0, 0, ""]));
+    // The last decision of a node that is killed goes with it.
+    drop((late, decisions));
+    let decisions = Node::of_package("decisions", &of_graph, domain, Some(built));
+    let mut late = Node::start(&["-c", LISTENER], domain, Some(built));
+    late.lines().until("decision", &no_graph);
     decisions.stop();
     hand.stop();
 }

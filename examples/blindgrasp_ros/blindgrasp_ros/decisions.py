@@ -1,12 +1,13 @@
-"""Publishes what a running graph decides and feels, in any RMW: ros2 run blindgrasp_ros decisions [GRAPH]
+"""Publishes what a running graph decides and feels, in any RMW: ros2 run blindgrasp_ros decisions GRAPH
 
 The topics, in the namespace /blindgrasp: `decision` (blindgrasp_msgs Decision, reliable, transient local); the outputs named by
 --outputs, as blindgrasp_msgs has them; `joint_states`, `cell_points`, `contact_points` and `hand_markers`, for RViz. The service
 `decide` waits for a decision. The state of the graph is on /diagnostics. The node waits for a graph that does not run. It needs
 rclpy, blindgrasp_msgs, and the program blindgrasp on the graph's machine.
 
-A LIFT whose time is over when it is published is a HOLD (`stale`). When the node begins and when the graph ends, however that
-happens, it publishes a HOLD (`no_graph`), which takes the place of the last decision for nodes that come later.
+A LIFT whose time is over when it is published is a HOLD (`stale`), and within a second after its time is over it is taken back by
+one. When the node begins and when the graph ends, however that happens, it publishes a HOLD (`no_graph`). A HOLD takes the place of
+the last decision for nodes that come later.
 """
 
 import argparse
@@ -20,6 +21,8 @@ import sys
 import threading
 import time
 import traceback
+
+from blindgrasp_ros.node import arguments, spin
 
 # Calls of `decide` that wait at the same time; each has a thread. The eldest makes room for a new one, without a decision.
 MAX_WAITING = 16
@@ -39,10 +42,11 @@ def boottime_nanos():
 
 def fill(message, decision, until_nanos):
     """Fills a Decision with one that is valid until a time of this machine, as it is said now; without a time it is not valid."""
+    # This clock is read first: a pause before the other one is read can only shorten the time.
+    wall_nanos = time.time_ns()
     left_nanos = max(0, (until_nanos or 0) - boottime_nanos())
     if decision["action"] == "lift" and until_nanos is not None and left_nanos == 0:
         decision = {**decision, "action": "hold", "reason": "stale", "probability_stable": 0.0}
-    wall_nanos = time.time_ns()
     for stamp, nanos in [(message.stamp, wall_nanos), (message.valid_until, wall_nanos + left_nanos)]:
         stamp.sec, stamp.nanosec = divmod(nanos, 1_000_000_000)
     message.action = getattr(type(message), decision["action"].upper())
@@ -164,8 +168,18 @@ class Publishing:
             self.decide(NO_GRAPH, None)
 
     def decide(self, decision, until_nanos):
-        self.decisions.set(decision, until_nanos)
-        self.decision.publish(fill(self.message(), decision, until_nanos))
+        # The threads of the graph's lines and of the timer publish.
+        with self.decisions.condition:
+            self.decisions.set(decision, until_nanos)
+            self.published = fill(self.message(), decision, until_nanos)
+            self.decision.publish(self.published)
+
+    def take_back(self):
+        """Publishes a HOLD in place of a LIFT whose time is over. A replay has no such time."""
+        with self.decisions.condition:
+            last, until_nanos = self.decisions.last, self.decisions.until_nanos
+            if self.published.action == self.message.LIFT and until_nanos is not None and not self.decisions.is_valid():
+                self.decide(last, until_nanos)
 
     def answer(self, request, response):
         found = self.decisions.wait(request.timeout_secs)
@@ -222,7 +236,7 @@ def serve(arguments):
     import rclpy
     from blindgrasp_msgs.srv import Decide
     from rclpy.callback_groups import ReentrantCallbackGroup
-    from rclpy.clock import Clock
+    from rclpy.clock import Clock, ClockType
     from rclpy.executors import MultiThreadedExecutor
 
     rclpy.init()
@@ -243,18 +257,8 @@ def serve(arguments):
     top = [arguments.program, "top", "--json", arguments.graph]
     threading.Thread(target=work, args=(echo, publishing.take, publishing.begin_anew), daemon=True).start()
     threading.Thread(target=work, args=(top, publishing.diagnose, publishing.has_no_state), daemon=True).start()
-    # rclpy can fall asleep on a signal that comes just then; it looks again when it wakes.
-    node.create_timer(1.0, lambda: None, clock=Clock())
-    try:
-        rclpy.spin(node, MultiThreadedExecutor(num_threads=MAX_WAITING + 4))
-    except KeyboardInterrupt:
-        pass
-    except Exception:
-        # A signal that ends ROS 2 makes rclpy.spin raise one of several errors.
-        if rclpy.ok():
-            raise
-    finally:
-        rclpy.try_shutdown()
+    node.create_timer(1.0, publishing.take_back, clock=Clock(clock_type=ClockType.STEADY_TIME))
+    spin(node, MultiThreadedExecutor(num_threads=MAX_WAITING + 4))
 
 
 def main():
@@ -263,13 +267,11 @@ def main():
     options.add_argument("--outputs", nargs="+", default=["decision", "tactile", "contacts"], help="of the graph, as NODE/PORT or PORT")
     options.add_argument("--namespace", default="/blindgrasp", help="of topics and service")
     options.add_argument("--program", default="blindgrasp", help="the program of the graph")
-    # rclpy reads what follows --ros-args.
-    own = sys.argv[1 : sys.argv.index("--ros-args")] if "--ros-args" in sys.argv else sys.argv[1:]
-    arguments = options.parse_args(own)
-    for program in (arguments.program, "setpriv"):
+    given = options.parse_args(arguments())
+    for program in (given.program, "setpriv"):
         if shutil.which(program) is None:
             sys.exit(f"the program {program} is not in PATH: install it" + (", or name it with --program" if program != "setpriv" else ""))
-    serve(arguments)
+    serve(given)
 
 
 if __name__ == "__main__":

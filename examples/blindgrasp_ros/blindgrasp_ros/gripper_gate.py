@@ -11,7 +11,7 @@ executes no step after a controller that does not succeed, so the arm stays. Nam
 
     grasp_gate: {type: GripperCommand, action_ns: gripper_cmd, joints: [finger_joint], default: true}
 
-While no node publishes decisions, goals that close on an object are rejected. It needs rclpy, control_msgs and blindgrasp_msgs, in
+Unless one node publishes decisions, goals that close on an object are rejected. It needs rclpy, control_msgs and blindgrasp_msgs, in
 any RMW. The gate makes no test lift: use a model and an arbiter that decide when the hand is
 settled, and read what they promise (`blindgrasp model show`). MoveIt gives a gripper 1.1 times the planned duration and
 0.5 s: set `allowed_goal_duration_margin` of the controller to the seconds that --wait allows.
@@ -23,9 +23,10 @@ ros2_controllers say so only after `stall_timeout`, which is 1 s: set it to 0.2.
 import argparse
 import collections
 import math
-import sys
 import threading
 import time
+
+from blindgrasp_ros.node import arguments, clock_fault, nanos_of, spin, topic_fault
 
 # Seconds between two looks whether a goal was cancelled, or a signal came.
 LOOK_S = 0.05
@@ -35,6 +36,8 @@ SUCCEEDED = 4
 LIFT, UNDECIDED = 1, (3, 4, 5, 6, 7)
 # The reason with which the node of decisions says that a graph has ended: the next one may count grasps anew.
 NO_GRAPH = "no_graph"
+# The reason with which it takes back a LIFT whose time is over.
+STALE = "stale"
 
 
 class Decisions:
@@ -52,7 +55,8 @@ class Decisions:
             if decision.reason == NO_GRAPH:
                 self.waiting.clear()
                 self.newest, self.has_ended = -1, True
-            else:
+            # The LIFT itself tells until when it was valid.
+            elif decision.reason != STALE or (LIFT, decision.grasp_id) not in [(it.action, it.grasp_id) for _, it in self.waiting]:
                 self.waiting.append((time.monotonic(), decision))
             self.condition.notify_all()
 
@@ -82,8 +86,10 @@ class Decisions:
                     _, came, decision = max(final, key=lambda found: found[:2])
                     if decision.action == LIFT:
                         # The clocks of two machines must agree (NTP).
-                        until_nanos = decision.valid_until.sec * 1_000_000_000 + decision.valid_until.nanosec
-                        over_ms = (time.time_ns() - until_nanos) / 1e6
+                        fault = clock_fault(decision)
+                        if fault:
+                            return False, fault
+                        over_ms = (time.time_ns() - nanos_of(decision.valid_until)) / 1e6
                         if over_ms < 0:
                             return True, decision.reason
                         hint = "; a controller that says late that the hand stands needs a shorter stall_timeout" if came < closed else ""
@@ -165,9 +171,9 @@ def serve(arguments):
             why = "another goal is executed"
         elif not positions or not all(map(math.isfinite, positions)):
             why = f"the positions {positions}, expected finite ones"
-        elif is_grasp(positions[0]) and not node.count_publishers(arguments.decisions):
-            why = f"no node publishes {arguments.decisions}"
         else:
+            why = topic_fault(node, arguments.decisions) if is_grasp(positions[0]) else None
+        if why is None:
             return GoalResponse.ACCEPT
         node.get_logger().warning(f"goal rejected: {why}")
         return GoalResponse.REJECT
@@ -200,6 +206,10 @@ def serve(arguments):
             return answer.status == SUCCEEDED, answer.result.stalled
 
         succeeds, why = gate.run(position, move, lambda: handle.is_cancel_requested or not rclpy.ok())
+        # Another graph may have begun to decide meanwhile.
+        fault = topic_fault(node, arguments.decisions) if succeeds and is_grasp(position) else None
+        if fault:
+            succeeds, why = False, fault
         if handle.is_cancel_requested:
             succeeds, why, end = False, "cancelled", handle.canceled
         else:
@@ -218,20 +228,7 @@ def serve(arguments):
         cancel_callback=lambda _: CancelResponse.ACCEPT,
     )
     # The answers of the controller come while a goal is executed.
-    executor = MultiThreadedExecutor(num_threads=4)
-    executor.add_node(node)
-    try:
-        # rclpy can fall asleep on a signal that comes just then; it looks again when it wakes.
-        while rclpy.ok():
-            executor.spin_once(timeout_sec=1.0)
-    except KeyboardInterrupt:
-        pass
-    except Exception:
-        # A signal that ends ROS 2 makes rclpy raise one of several errors.
-        if rclpy.ok():
-            raise
-    finally:
-        rclpy.try_shutdown()
+    spin(node, MultiThreadedExecutor(num_threads=4))
 
 
 def main():
@@ -244,9 +241,7 @@ def main():
     options.add_argument("--parallel", action="store_true", help="ParallelGripperCommand instead of GripperCommand")
     options.add_argument("--name", default="grasp_gate", help="of the node: each gripper has a gate of its own")
     options.add_argument("--decisions", default="/blindgrasp/decision", help="the topic of decisions")
-    # rclpy reads what follows --ros-args.
-    own = sys.argv[1 : sys.argv.index("--ros-args")] if "--ros-args" in sys.argv else sys.argv[1:]
-    serve(options.parse_args(own))
+    serve(options.parse_args(arguments()))
 
 
 if __name__ == "__main__":

@@ -45,6 +45,7 @@ import sys
 import time
 
 from blindgrasp_ros import line_protocol
+from blindgrasp_ros.node import arguments, spin
 
 WORDS = ("open", "closing", "settled", "squeezing", "squeezed", "test_lifting", "test_lifted", "lifting", "ended", "kept", "dropped")
 # Angles older than this are missed: joint_states often comes at 10 to 30 Hz. Messages that waited for longer make no frame.
@@ -419,7 +420,6 @@ def message_class(where, name, field):
 
 def bridge(table, address, hand=None):
     import rclpy
-    from rclpy.clock import Clock
     from rclpy.executors import SingleThreadedExecutor
     from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
     from rclpy.subscription import Subscription
@@ -500,32 +500,21 @@ def bridge(table, address, hand=None):
     for idx, entry in enumerate(table["cells"]):
         take = lambda message, came_nanos, waited_nanos, _, idx=idx: take_cells(idx, message, came_nanos, waited_nanos)
         subscribe(f"cells[{idx}]", entry, "std_msgs/msg/Float64MultiArray", entry.get("field", "data"), take, True)
-    # rclpy can fall asleep on a signal that comes just then; it looks again when it wakes.
-    node.create_timer(1.0, lambda: None, clock=Clock())
-    try:
-        rclpy.spin(node, executor)
-    except Exception:
-        # A signal that ends ROS 2 makes rclpy.spin raise one of several errors.
-        if rclpy.ok():
-            raise
-    finally:
-        rclpy.try_shutdown()
+    spin(node, executor)
 
 
 def work():
     options = line_protocol.options(__doc__)
     options.add_argument("table", help="the topics (YAML)")
-    # rclpy reads what follows --ros-args.
-    own = sys.argv[1 : sys.argv.index("--ros-args")] if "--ros-args" in sys.argv else sys.argv[1:]
-    arguments = options.parse_args(own)
+    given = options.parse_args(arguments())
     import yaml
 
-    with open(arguments.table, encoding="utf-8") as file:
+    with open(given.table, encoding="utf-8") as file:
         table = yaml.safe_load(file)
     try:
-        bridge(table, arguments.address, arguments.hand)
+        bridge(table, given.address, given.hand)
     except ValueError as error:
-        sys.exit(f"{arguments.table}: {error}")
+        sys.exit(f"{given.table}: {error}")
 
 
 def main():

@@ -7,10 +7,10 @@ import time
 
 import rclpy
 from blindgrasp_msgs.msg import Decision
-from rclpy.clock import Clock
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.time import Time
+
+from blindgrasp_ros.node import clock_fault, nanos_of, spin, topic_fault
 
 # Two LIFTs of one grasp that are valid until times less than this apart are one decision: a graph needs longer to start.
 SAME_RUN_NANOS = 1_000_000_000
@@ -23,7 +23,7 @@ class LiftGate(Node):
         self.lifted_grasp, self.lifted_until_nanos = None, 0
         # The last decision is kept for a node that starts late: it may be an old one.
         qos = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self.create_subscription(Decision, "/blindgrasp/decision", self.on_decision, qos)
+        self.subscription = self.create_subscription(Decision, "/blindgrasp/decision", self.on_decision, qos)
 
     def on_decision(self, decision):
         if decision.action in (Decision.TIGHTEN, Decision.SET_DOWN, Decision.GO_ON):
@@ -34,9 +34,14 @@ class LiftGate(Node):
             self.get_logger().info(f"grasp {decision.grasp_id}: hold, {decision.reason}")
             return
         # valid_until is a time of the wall clock, whatever use_sim_time says; the clocks of two machines must agree (NTP).
-        until_nanos = Time.from_msg(decision.valid_until).nanoseconds
+        until_nanos = nanos_of(decision.valid_until)
         if time.time_ns() >= until_nanos:
             self.get_logger().warning(f"grasp {decision.grasp_id}: LIFT is no longer valid, hold")
+            return
+        # A decision may come before the node knows its publisher.
+        fault = clock_fault(decision) or topic_fault(self, self.subscription.topic_name, n_least=0)
+        if fault:
+            self.get_logger().warning(f"grasp {decision.grasp_id}: hold, {fault}")
             return
         # A grasp is lifted once, however often its decision comes. A graph that is started again counts from 0 again, and
         # decides at least a second later.
@@ -52,19 +57,7 @@ class LiftGate(Node):
 
 def main():
     rclpy.init()
-    try:
-        gate = LiftGate()
-        # rclpy can fall asleep on a signal that comes just then; it looks again when it wakes.
-        gate.create_timer(1.0, lambda: None, clock=Clock())
-        rclpy.spin(gate)
-    except KeyboardInterrupt:
-        pass
-    except Exception:
-        # A signal that ends ROS 2 makes rclpy.spin raise one of several errors.
-        if rclpy.ok():
-            raise
-    finally:
-        rclpy.try_shutdown()
+    spin(LiftGate())
 
 
 if __name__ == "__main__":
