@@ -16,7 +16,7 @@ import os
 import sys
 from pathlib import Path
 
-COLUMNS = ["recording", "grasp_id", "object", "class", "stable", "hand_id", "dictionary_id"]
+COLUMNS = ["recording", "grasp_id", "object", "object_class", "stable", "hand_id", "dictionary_id"]
 
 
 def main():

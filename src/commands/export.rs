@@ -26,8 +26,8 @@ use blindgrasp_stages::model::Model;
                         blindgrasp export data/train --features models/barrett-bh8-280.json --out features.csv\n\n\
                         A line is {\"topic\", \"seq\", \"stamp_nanos\", \"data\": {…}}; NaN and infinity are null.\n\
                         features: a row for each grasp with a label and a contact, of its first settled frame: recording, \
-                        grasp_id, object, class, stable (1 or 0), hand_id, dictionary_id, then the values as the encoder sends \
-                        them, each under its name: hist_3, finger_1.load, spread.position …")]
+                        grasp_id, object, object_class, stable (1 or 0), hand_id, dictionary_id, then the values as the encoder \
+                        sends them, each under its name: hist_3, finger_1.load, spread.position …")]
 pub(super) struct Arguments {
     /// The recording (MCAP); with --features, recordings or folders of them.
     #[arg(required = true, value_name = "RECORDING")]

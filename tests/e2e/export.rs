@@ -42,7 +42,8 @@ fn a_column_of_features_says_what_it_is() {
     let made = text(&run(&["export", RECORDING, "--features", MODEL, "--out", utf8(&path)], 0).stdout);
     let table = std::fs::read_to_string(&path).expect("written");
     let header: Vec<&str> = table.lines().next().expect("a header").split(',').collect();
-    let named = ["recording", "grasp_id", "object", "class", "stable", "hand_id", "dictionary_id", "hist_0", "hist_1"];
+    let named =
+        ["recording", "grasp_id", "object", "object_class", "stable", "hand_id", "dictionary_id", "hist_0", "hist_1"];
     assert_eq!(header[..named.len()], named);
     for column in ["hist_7", "palm.load", "finger_1.max_force", "spread.position", "distal_3.breakaway"] {
         assert!(header.contains(&column), "{column}: {header:?}");

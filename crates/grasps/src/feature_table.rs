@@ -44,7 +44,8 @@ pub fn write_feature_table(
     labels_of(recordings)?;
     let identity = [format!("{:016x}", model.hand.id), format!("{:016x}", model.dictionary_id())];
     let mut table = csv::Writer::from_writer(to);
-    let names = ["recording", "grasp_id", "object", "class", "stable", "hand_id", "dictionary_id"].map(String::from);
+    let names =
+        ["recording", "grasp_id", "object", "object_class", "stable", "hand_id", "dictionary_id"].map(String::from);
     table.write_record(names.into_iter().chain(model.features.value_names(hand)))?;
     let (mut n_rows, mut n_excluded) = (0, BTreeMap::new());
     let (mut values, mut objects, mut seen) = (Vec::new(), Vec::new(), SeenReadings::new());
