@@ -51,7 +51,7 @@ impl Ending {
 }
 
 impl<S: Surroundings> Lifecycle<S> {
-    /// Begins to ask one operator after the other, sources first, to answer what is left. An operator that dies meanwhile is
+    /// Begins to ask one operator after the other, sources first, to answer the samples left. An operator that dies meanwhile is
     /// started again, if it may be.
     pub(super) fn begin_draining(&mut self) {
         self.abandon_swap("the graph is stopping");

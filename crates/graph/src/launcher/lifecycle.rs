@@ -44,7 +44,7 @@ pub(super) trait Surroundings {
     /// Begins one process for these nodes. [`Lifecycle::on_begun`] or [`Lifecycle::on_not_begun`] tells the outcome.
     fn start(&mut self, orders: Vec<StartOrder>) -> Result<(), LaunchError>;
     fn tell(&mut self, id: u64, command: &Command);
-    /// Asks a process to answer what has come, and to report that it has drained.
+    /// Asks a process to answer the samples that have come, and to report that it has drained.
     fn ask_to_drain(&mut self, id: u64);
     /// Lets a process exit.
     fn let_go(&mut self, id: u64);

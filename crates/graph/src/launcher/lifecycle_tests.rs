@@ -216,7 +216,7 @@ impl Surroundings for World {
     }
 }
 
-/// A graph, and what has happened to it.
+/// A graph and its history.
 #[derive(Clone)]
 struct History {
     life: Lifecycle<World>,
@@ -473,7 +473,7 @@ impl History {
     }
 }
 
-/// What the histories have ended with.
+/// The ends of the histories.
 #[derive(Default)]
 struct Found {
     n_histories: usize,

@@ -1,6 +1,6 @@
 //! Starts, supervises and stops a graph's processes. It never touches samples.
 //!
-//! One loop takes in what happens, and carries out what the pure rules order (`lifecycle`). It waits for nothing else.
+//! One loop takes in events, and carries out the orders of the pure rules (`lifecycle`). It waits for nothing else.
 //!
 //! Each operator is a process in a process group of its own, so that Ctrl-C reaches the launcher alone. It then stops
 //! the graph in its order: sources first, each operator drained before the next is asked, so that everything in flight
@@ -217,7 +217,7 @@ impl Launcher {
     /// Orders the start of all processes of a graph, and answers commands on `control`.
     ///
     /// # Errors
-    /// A program cannot be started, or the socket cannot be used; processes already started are killed.
+    /// The socket cannot be used.
     pub fn start(
         graph: &Graph,
         name: &str,
@@ -271,10 +271,18 @@ impl Launcher {
             server::serve(control, pins, &launcher.life.site.events, audit_log).map_err(LaunchError::Control)?;
         launcher.server = Some(server);
         launcher.life.launch();
-        while launcher.pids().len() < graph.nodes.len() {
-            launcher.turn()?;
-        }
         Ok(launcher)
+    }
+
+    /// Waits until each process has begun, or for `should_stop`: files with a digest are read before.
+    ///
+    /// # Errors
+    /// A program cannot be started.
+    pub fn wait_until_begun(&mut self, should_stop: &dyn Fn() -> bool) -> Result<(), LaunchError> {
+        while self.pids().len() < self.life.members.len() && !should_stop() && !self.life.is_asked_to_stop {
+            self.turn()?;
+        }
+        Ok(())
     }
 
     /// Node ids and process ids, in the graph's order.
@@ -405,7 +413,7 @@ impl Launcher {
         if self.is_to_begin_again && self.life.is_asked_to_stop { End::Stopped } else { end }
     }
 
-    /// Asks one operator after the other, sources first, to answer what is left, and waits for it: for all of them
+    /// Asks one operator after the other, sources first, to answer the samples left, and waits for it: for all of them
     /// within the grace period, and not at all once `should_hurry`. An operator that dies meanwhile is started again,
     /// if it may be.
     ///
@@ -455,7 +463,7 @@ impl Launcher {
         self.life.error_of_end().map_or(Ok(()), Err)
     }
 
-    /// One round: takes in what has happened, acts on it, and answers clients.
+    /// One round: takes in events, acts on them, and answers clients.
     fn turn(&mut self) -> Result<(), LaunchError> {
         self.look();
         if let Some(error) = self.life.site.failure.take() {
@@ -482,7 +490,7 @@ impl Launcher {
         Ok(())
     }
 
-    /// Listens for as long as nothing is due, and acts on what has happened.
+    /// Listens for as long as nothing is due, and acts on events.
     fn look(&mut self) {
         self.listen(self.life.pause());
         self.life.now = self.started.elapsed();

@@ -398,7 +398,7 @@ impl<S: Surroundings> Lifecycle<S> {
                 // It still answers the samples of the target before it.
                 if at > 0 && !self.has_caught_up(&swap.targets[..at], idx) {
                     if is_late {
-                        return self.take_back(swap, &format!("node '{id}' did not answer what was sent to it"));
+                        return self.take_back(swap, &format!("node '{id}' did not answer its samples"));
                     }
                     return Next::Waits;
                 }
