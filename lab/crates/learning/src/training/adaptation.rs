@@ -37,8 +37,8 @@ const UNLIKE_SHARE: f64 = 0.1;
 /// Own grasps without which no limit is widened.
 const FEWEST_FOR_LIMITS: usize = 30;
 
-/// The model, corrected by the labelled grasps of recordings: lifts of robots of one hand, or grasps of one day for a model that looks
-/// at days. The grasps count as trained on. `robots` names the robot of each recording.
+/// The model, corrected by the labelled grasps of recordings: lifts of robots of one hand, or grasps of one day for a model
+/// that looks at days. The grasps count as trained on. `robots` names the robot of each recording.
 ///
 /// # Errors
 /// Recordings that cannot be used, whose label is the paper's, that the model was trained on, or with too few labelled grasps.
