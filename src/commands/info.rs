@@ -12,7 +12,7 @@ use blindgrasp_graph::client::{is_graph_name, running_graphs};
 use blindgrasp_grasps::dataset::{REPORT_METADATA, hand_of};
 use blindgrasp_grasps::summary::{Overview, RecordingsSummary};
 use blindgrasp_operator::diagnostics::print_diagnostic;
-use blindgrasp_operator::text::did_you_mean;
+use blindgrasp_operator::text::{counted, did_you_mean};
 use blindgrasp_recording::{RecordingIndex, RepairReport, recordings_in, repair};
 use blindgrasp_stages::hand::{Hand, builtin_names};
 use blindgrasp_stages::label::Label;
@@ -136,6 +136,9 @@ fn print_repair(report: &RepairReport) -> anyhow::Result<()> {
     }
     if report.n_of_unknown_topics > 0 {
         lost.push(format!("{} messages of unknown topics", report.n_of_unknown_topics));
+    }
+    if report.n_lost_attachments > 0 {
+        lost.push(counted(report.n_lost_attachments, "attachment"));
     }
     if report.n_skipped_bytes > 0 {
         lost.push(format!("{} bytes that are no record", report.n_skipped_bytes));

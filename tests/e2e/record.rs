@@ -317,7 +317,7 @@ fn a_full_disk_ends_the_recording_and_not_the_graph() {
     let folder = tempfile::tempdir().expect("a folder");
     let small = folder.path().join("small");
     std::fs::create_dir(&small).expect("made");
-    let mount = format!("mount -t tmpfs -o size=6m none {} && exec \"$@\"", small.display());
+    let mount = format!("mount -t tmpfs -o size=4m none {} && exec \"$@\"", small.display());
     let within = |arguments: &[&str]| {
         let mut command = Command::new("unshare");
         command.args(["-m", "sh", "-c", &mount, "sh"]).args(arguments).current_dir(crate::common::project());

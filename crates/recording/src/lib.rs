@@ -45,6 +45,8 @@ pub mod cdr {
 }
 
 pub use blindgrasp_messages::Record;
+pub use mcap::Attachment;
+
 pub use chosen::{Choice, ChosenSamples, RawSample, Reach};
 pub use index::{IndexedTopic, RecordingIndex};
 pub use live::{LiveOptions, LiveRecorder, LiveSummary};
@@ -52,6 +54,7 @@ pub use parts::{Manifest, part_path, recordings_in};
 pub use problems::{Oddity, Problem, Problems};
 pub use reader::RecordingReader;
 pub use repair::{RepairReport, repair, repaired_path};
+pub use summary::attachments;
 pub use viewer::{LinkPose, LinkPoses, ShownHand, TOPICS_FOR_VIEWERS};
 pub use writer::RecordingWriter;
 

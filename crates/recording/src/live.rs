@@ -28,7 +28,7 @@ pub struct LiveOptions {
     pub rotate_after: Option<Duration>,
     /// The hand; without it viewers see contacts alone.
     pub hand: Option<ShownHand>,
-    /// Files to attach to the first file, by name, beside those of the hand.
+    /// Files to attach to the first file, by name. Those of the hand are attached to each file.
     pub attachments: BTreeMap<String, Vec<u8>>,
     /// Further metadata, by name; each file has all of it.
     pub metadata: BTreeMap<String, BTreeMap<String, String>>,
@@ -277,10 +277,9 @@ impl LiveRecorder {
         if self.options.is_split() {
             metadata.push((PART_METADATA_NAME, &part));
         }
-        let mut attachments: Vec<(&str, &[u8])> = Vec::new();
+        let mut attachments: Vec<(&str, &[u8])> = self.viewer.hand.iter().flat_map(ShownHand::files).collect();
         if self.n_parts == 0 {
             attachments.extend(self.options.attachments.iter().map(|(name, data)| (name.as_str(), data.as_slice())));
-            attachments.extend(self.viewer.hand.iter().flat_map(ShownHand::files));
         }
         let file = LiveFile::create(&path, self.options.overwrite, &metadata, &attachments)?;
         self.n_parts += 1;

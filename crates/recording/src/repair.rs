@@ -1,6 +1,6 @@
 //! Makes a recording of the whole samples in a recording that was cut off or damaged.
 //!
-//! Nothing is made up: samples are copied as they are. A chunk with a wrong checksum is left out; of a chunk that is
+//! Nothing is made up: samples and attachments are copied as they are. A chunk with a wrong checksum is left out; of a chunk that is
 //! cut off, the beginning is taken. Samples that no checksum covers are counted separately.
 
 use std::collections::BTreeMap;
@@ -11,13 +11,13 @@ use std::path::{Path, PathBuf};
 
 use blindgrasp_messages::files::partial_path;
 use mcap::Writer;
-use mcap::records::{MessageHeader, Metadata, Record as McapRecord, op};
+use mcap::records::{MessageHeader, Metadata, Record as McapRecord, Statistics, op};
 use mcap::sans_io::{LinearReader, LinearReaderOptions};
 use serde::{Serialize, Serializer};
 
 use super::channels::Channels;
 use super::reader::{RecordingReader, message_parts};
-use super::source::{Growth, MAX_RECORD_BYTES, PREFIX_BYTES, parse_record, read_records};
+use super::source::{Growth, MAX_RECORD_BYTES, PREFIX_BYTES, parse_attachment, parse_record, read_records};
 use super::summary::{info_from_metadata, is_being_written, open_mcap, raw_summary};
 use super::writer::{complete, info_metadata, lock_partial, write_error, write_options};
 use super::{METADATA_NAME, RecordingError, RecordingInfo};
@@ -32,7 +32,7 @@ const ZSTD_NAME: &[u8] = b"\x04\0\0\0zstd";
 const DATA_END_CONTENT_BYTES: u64 = 4;
 /// Bytes of the file that are searched at a time.
 const WINDOW_BYTES: usize = 1 << 20;
-/// The longest record beside chunks: metadata. A damaged length would otherwise hide the records behind it.
+/// The longest record beside chunks and attachments: metadata. A damaged length would otherwise hide the records behind it.
 const MAX_METADATA_BYTES: u64 = 16 << 20;
 
 /// The outcome of a repair.
@@ -55,6 +55,8 @@ pub struct RepairReport {
     pub n_lost: BTreeMap<String, u64>,
     /// Lost messages of unknown topics.
     pub n_of_unknown_topics: u64,
+    /// Lost attachments, as far as the rest of the file tells.
+    pub n_lost_attachments: u64,
     /// Whole chunks.
     pub n_chunks: u64,
     /// Damaged chunks, which were left out.
@@ -77,6 +79,7 @@ impl RepairReport {
             || self.has_partial_chunk
             || self.n_skipped_bytes > 0
             || self.n_of_unknown_topics > 0
+            || self.n_lost_attachments > 0
             || self.n_lost.values().any(|n_lost| *n_lost > 0)
     }
 }
@@ -119,8 +122,8 @@ struct Repair {
     is_past_data: bool,
     /// The chunks' offsets by the summary; none without a summary.
     chunk_offsets: Vec<u64>,
-    /// The messages of each channel by the summary.
-    expected: Option<BTreeMap<u16, u64>>,
+    /// The numbers of messages and attachments by the summary.
+    expected: Option<Statistics>,
     channels: Channels,
     salvage: Salvage,
     metadata: BTreeMap<String, BTreeMap<String, String>>,
@@ -137,6 +140,7 @@ struct Salvage {
     n_replaced: u64,
     /// Messages taken from the present chunk, by channel.
     n_of_chunk: BTreeMap<u16, u64>,
+    n_attachments: u64,
     failed: Option<mcap::McapError>,
 }
 
@@ -161,7 +165,7 @@ impl Repair {
         if let Ok(summary) = raw_summary(&mut file, n_file_bytes) {
             chunk_offsets.extend(summary.chunks.iter().map(|index| index.chunk_start_offset));
             channels = summary.channels;
-            expected = summary.statistics.map(|statistics| statistics.channel_message_counts);
+            expected = summary.statistics;
         }
         let partial = lock_partial(output)?;
         let writer = write_options().create(BufWriter::new(partial)).map_err(|error| write_error(output, error))?;
@@ -172,7 +176,14 @@ impl Repair {
             chunk_offsets,
             expected,
             channels,
-            salvage: Salvage { writer, ids: BTreeMap::new(), n_replaced: 0, n_of_chunk: BTreeMap::new(), failed: None },
+            salvage: Salvage {
+                writer,
+                ids: BTreeMap::new(),
+                n_replaced: 0,
+                n_of_chunk: BTreeMap::new(),
+                n_attachments: 0,
+                failed: None,
+            },
             metadata: BTreeMap::new(),
             growth: Growth::default(),
             report: RepairReport { input: path.into(), ..RepairReport::default() },
@@ -197,14 +208,15 @@ impl Repair {
         Ok(report)
     }
 
-    /// Counts the lost messages of each topic by the summary, if there is one: it is complete, the rest of the indexes may
-    /// not be.
+    /// Counts the lost attachments, and the lost messages of each topic, by the summary, if there is one: it is complete, the
+    /// rest of the indexes may not be.
     fn count_lost(&mut self) {
         let report = &mut self.report;
         if let Some(expected) = &self.expected {
+            report.n_lost_attachments = u64::from(expected.attachment_count).saturating_sub(self.salvage.n_attachments);
             report.n_lost.clear();
             for known in self.channels.iter() {
-                let n_expected = expected.get(&known.channel.id).copied().unwrap_or(0);
+                let n_expected = expected.channel_message_counts.get(&known.channel.id).copied().unwrap_or(0);
                 *report.n_lost.entry(known.channel.topic.clone()).or_default() += n_expected;
             }
             for (topic, n_lost) in &mut report.n_lost {
@@ -235,12 +247,13 @@ impl Repair {
             if end > self.n_file_bytes && (self.is_past_data || opcode == op::MESSAGE_INDEX) {
                 return Ok(());
             }
-            if end > self.n_file_bytes || n_bytes > MAX_METADATA_BYTES || !self.is_plausible(end)? {
+            if end > self.n_file_bytes || n_bytes > longest(opcode) || !self.is_plausible(end)? {
+                self.report.n_lost_attachments += u64::from(opcode == op::ATTACHMENT);
                 at = self.skip_to_chunk(at)?;
                 continue;
             }
             match opcode {
-                op::SCHEMA | op::CHANNEL | op::METADATA | op::MESSAGE | op::MESSAGE_INDEX => {
+                op::SCHEMA | op::CHANNEL | op::METADATA | op::ATTACHMENT | op::MESSAGE | op::MESSAGE_INDEX => {
                     let data = self.read(at + PREFIX_BYTES, n_bytes)?;
                     self.record(opcode, &data, last_chunk_is_damaged);
                 }
@@ -269,6 +282,7 @@ impl Repair {
         match opcode {
             op::SCHEMA | op::CHANNEL => self.channels.replace(opcode, data, false),
             op::MESSAGE => self.salvage.message(data, false, &self.channels, &mut self.report),
+            op::ATTACHMENT => self.salvage.attachment(data, &mut self.report),
             op::METADATA => {
                 if let Ok(McapRecord::Metadata(found)) = parse_record(opcode, data) {
                     self.metadata.insert(found.name, found.metadata);
@@ -368,7 +382,7 @@ impl Repair {
             Some((opcode, n_bytes)) => {
                 // A chunk's own lengths are checked instead.
                 let is_chunk = opcode == op::CHUNK && self.chunk_at(at)?.is_some();
-                is_chunk || ((op::HEADER..=op::DATA_END).contains(&opcode) && n_bytes <= MAX_METADATA_BYTES)
+                is_chunk || ((op::HEADER..=op::DATA_END).contains(&opcode) && n_bytes <= longest(opcode))
             }
         })
     }
@@ -467,6 +481,18 @@ impl Salvage {
         }
     }
 
+    /// Copies an attachment, if its checksum is right.
+    fn attachment(&mut self, record: &[u8], report: &mut RepairReport) {
+        let Ok(attachment) = parse_attachment(record) else {
+            report.n_lost_attachments += 1;
+            return;
+        };
+        match self.writer.attach(&attachment) {
+            Ok(()) => self.n_attachments += 1,
+            Err(error) => self.failed = Some(error),
+        }
+    }
+
     fn output_id(&mut self, channel_id: u16, channels: &Channels) -> mcap::McapResult<u16> {
         let Some(known) = channels.get(channel_id) else { return Ok(0) };
         let channel = &known.channel;
@@ -515,6 +541,11 @@ impl Read for FileSlice<'_> {
     }
 }
 
+/// The length of the longest record of that kind beside chunks.
+fn longest(opcode: u8) -> u64 {
+    if opcode == op::ATTACHMENT { MAX_RECORD_BYTES as u64 } else { MAX_METADATA_BYTES }
+}
+
 /// The report of a recording that needs no repair; `None` if it needs one.
 fn report_of_whole(path: &Path) -> Option<RepairReport> {
     let mut report = RepairReport {
@@ -552,8 +583,53 @@ fn repair_metadata(path: &Path, report: &RepairReport) -> BTreeMap<String, Strin
     BTreeMap::from([
         ("of".into(), name),
         ("n_lost".into(), n_lost.to_string()),
+        ("n_lost_attachments".into(), report.n_lost_attachments.to_string()),
         ("n_unverified".into(), report.n_unverified.values().sum::<u64>().to_string()),
         ("n_damaged_chunks".into(), report.n_damaged_chunks.to_string()),
         ("has_partial_chunk".into(), report.has_partial_chunk.to_string()),
     ])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::tests::{info, records};
+    use crate::{RecordingWriter, attachments};
+    use mcap::Attachment;
+
+    #[test]
+    fn whole_attachments_are_recovered_and_lost_ones_are_counted() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("run.mcap");
+        let mut writer = RecordingWriter::create(&path, &info()).expect("created");
+        // One is longer than any metadata.
+        for (name, n_bytes) in [("hand.urdf", 1_000), ("model.json", 2_000), ("camera.bin", MAX_METADATA_BYTES + 1)] {
+            let data = vec![b'x'; n_bytes as usize].into();
+            let attachment =
+                Attachment { log_time: 1, create_time: 2, name: name.into(), media_type: "a/b".into(), data };
+            writer.attach(&attachment).expect("attached");
+        }
+        records().iter().for_each(|(topic, record)| writer.write_record(topic, record).expect("written"));
+        writer.finish().expect("finished");
+        let (whole, attached) = (std::fs::read(&path).expect("read"), attachments(&path).expect("read"));
+        assert_eq!(attached.len(), 3);
+        let repaired = |bytes: &[u8]| {
+            std::fs::write(&path, bytes).expect("written");
+            let report = repair(&path).expect("repaired");
+            let found = attachments(&repaired_path(&path)).expect("read");
+            std::fs::remove_file(repaired_path(&path)).expect("removed");
+            assert_eq!((report.has_loss(), report.n_skipped_bytes), (report.n_lost_attachments > 0, 0), "{report:?}");
+            (report.n_lost_attachments, found)
+        };
+        let without_end = whole.len() - 100;
+        assert!(repaired(&whole[..without_end]) == (0, attached));
+        let mut damaged = whole.clone();
+        let at = whole.windows(10).position(|found| found == b"model.json").expect("there");
+        damaged[at + 100] = b'y';
+        for n_bytes in [whole.len(), without_end] {
+            let (n_lost, found) = repaired(&damaged[..n_bytes]);
+            let names: Vec<&str> = found.iter().map(|file| file.name.as_str()).collect();
+            assert_eq!((n_lost, names), (1, vec!["hand.urdf", "camera.bin"]), "{n_bytes} bytes");
+        }
+    }
 }

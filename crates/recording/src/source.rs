@@ -5,9 +5,9 @@ use std::fs::File;
 use std::io::{BufReader, Read};
 use std::ops::Range;
 
-use mcap::McapError;
 use mcap::records::{Record as McapRecord, op};
 use mcap::sans_io::{LinearReadEvent, LinearReader};
+use mcap::{Attachment, McapError};
 
 /// The longest record, far longer than ours: a damaged length would otherwise take all memory.
 pub(super) const MAX_RECORD_BYTES: usize = 256 << 20;
@@ -28,7 +28,8 @@ enum Field {
     Numbers,
 }
 
-/// The fields of the records that have texts, up to the last of them (MCAP specification, "Records").
+/// The fields of the records that have texts, up to the last of them (MCAP specification, "Records"). An attachment has its
+/// length and checksum behind them, which MCAP's library takes for granted.
 fn fields(opcode: u8) -> &'static [Field] {
     use Field::{Bytes, Numbers, Text, Texts};
     match opcode {
@@ -37,7 +38,7 @@ fn fields(opcode: u8) -> &'static [Field] {
         op::CHANNEL => &[Bytes(2 + 2), Text, Text, Texts],
         op::CHUNK => &[Bytes(8 + 8 + 8 + 4), Text],
         op::CHUNK_INDEX => &[Bytes(8 + 8 + 8 + 8), Numbers, Bytes(8), Text],
-        op::ATTACHMENT => &[Bytes(8 + 8), Text, Text],
+        op::ATTACHMENT => &[Bytes(8 + 8), Text, Text, Bytes(8 + 4)],
         op::ATTACHMENT_INDEX => &[Bytes(8 + 8 + 8 + 8 + 8), Text, Text],
         op::METADATA => &[Text, Texts],
         op::METADATA_INDEX => &[Bytes(8 + 8), Text],
@@ -68,6 +69,15 @@ pub(super) fn parse_record(opcode: u8, data: &[u8]) -> Result<McapRecord<'_>, St
         }
     }
     mcap::parse_record(opcode, data).map_err(|error| with_cause(&error))
+}
+
+/// Reads the record of an attachment, and checks it by its checksum if it has one.
+pub(super) fn parse_attachment(data: &[u8]) -> Result<Attachment<'_>, String> {
+    let McapRecord::Attachment { header, data, .. } = parse_record(op::ATTACHMENT, data)? else {
+        return Err("it is no attachment".into());
+    };
+    let (log_time, create_time) = (header.log_time, header.create_time);
+    Ok(Attachment { log_time, create_time, name: header.name, media_type: header.media_type, data })
 }
 
 fn take<'a>(rest: &mut &'a [u8], n: usize) -> Result<&'a [u8], String> {

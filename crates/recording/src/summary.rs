@@ -1,5 +1,6 @@
 //! The summary at the end of a file.
 
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
@@ -7,12 +8,15 @@ use std::path::Path;
 
 use blindgrasp_messages::file_kind::FileKind;
 use blindgrasp_messages::files::open_regular;
+use mcap::Attachment;
 use mcap::records::{ChunkIndex, MetadataIndex, Record as McapRecord, Statistics, op};
 use mcap::sans_io::{LinearReader, LinearReaderOptions};
 
 use super::channels::{CONVERT, Channels};
 use super::repair::unknown_info;
-use super::source::{Growth, MAX_RECORD_BYTES, PREFIX_BYTES, longest_record, parse_record, read_records};
+use super::source::{
+    Growth, MAX_RECORD_BYTES, PREFIX_BYTES, longest_record, parse_attachment, parse_record, read_records,
+};
 use super::{METADATA_NAME, RecordingError, RecordingInfo};
 
 /// Bytes of the footer: opcode and length, its 20 bytes, and MCAP's mark behind it.
@@ -85,6 +89,22 @@ pub(super) fn open(path: &Path) -> Result<(File, FileSummary), RecordingError> {
     }
     let RawSummary { channels, statistics, chunks, .. } = raw;
     Ok((file, FileSummary { info, metadata, channels, statistics, chunks, n_file_bytes }))
+}
+
+/// The files that are attached to a recording, in its order.
+///
+/// # Errors
+/// As [`super::RecordingReader::open`], or an attachment is damaged.
+pub fn attachments(path: &Path) -> Result<Vec<Attachment<'static>>, RecordingError> {
+    let (mut file, summary) = open(path)?;
+    let damaged =
+        |message| RecordingError::Damaged { path: path.into(), message: format!("its attachments: {message}") };
+    let mut attachments = Vec::new();
+    for data in records_in_data(&mut file, summary.n_file_bytes, op::ATTACHMENT).map_err(damaged)? {
+        let attachment = parse_attachment(&data).map_err(damaged)?;
+        attachments.push(Attachment { data: Cow::Owned(attachment.data.into_owned()), ..attachment });
+    }
+    Ok(attachments)
 }
 
 /// What to say of a recording whose messages are not ours.
@@ -242,24 +262,35 @@ fn check_chunks(chunks: &mut [ChunkIndex], data_end: u64) -> Result<(), String> 
     Ok(())
 }
 
-/// The metadata between the chunks, by name. Chunks are passed over: they have none.
+/// The metadata between the chunks, by name.
 fn metadata_in_data(file: &mut File, n_file_bytes: u64) -> Result<BTreeMap<String, BTreeMap<String, String>>, String> {
+    let mut all = BTreeMap::new();
+    for data in records_in_data(file, n_file_bytes, op::METADATA)? {
+        if let McapRecord::Metadata(found) = parse_record(op::METADATA, &data)? {
+            all.insert(found.name, found.metadata);
+        }
+    }
+    Ok(all)
+}
+
+/// The contents of the records of one kind between the chunks, in order.
+fn records_in_data(file: &mut File, n_file_bytes: u64, kind: u8) -> Result<Vec<Vec<u8>>, String> {
     let text = |error: std::io::Error| error.to_string();
     let mut input = std::io::BufReader::new(file);
     input.seek(SeekFrom::Start(mcap::MAGIC.len() as u64)).map_err(text)?;
-    let mut all = BTreeMap::new();
+    let mut found = Vec::new();
     loop {
         let mut prefix = [0; PREFIX_BYTES as usize];
         input.read_exact(&mut prefix).map_err(text)?;
         let [opcode, n_bytes @ ..] = prefix;
         let n_bytes = u64::from_le_bytes(n_bytes);
         if opcode == op::DATA_END || opcode == op::FOOTER {
-            return Ok(all);
+            return Ok(found);
         }
         if n_bytes > n_file_bytes {
             return Err(format!("a record of {n_bytes} bytes: more than there are"));
         }
-        if opcode != op::METADATA {
+        if opcode != kind {
             input.seek_relative(n_bytes as i64).map_err(text)?;
             continue;
         }
@@ -268,9 +299,7 @@ fn metadata_in_data(file: &mut File, n_file_bytes: u64) -> Result<BTreeMap<Strin
         }
         let mut data = vec![0; n_bytes as usize];
         input.read_exact(&mut data).map_err(text)?;
-        if let McapRecord::Metadata(found) = parse_record(op::METADATA, &data)? {
-            all.insert(found.name, found.metadata);
-        }
+        found.push(data);
     }
 }
 

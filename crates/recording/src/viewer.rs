@@ -57,9 +57,14 @@ pub struct LinkPose {
 }
 
 impl ShownHand {
+    /// The attached pad layout.
+    pub const LAYOUT_NAME: &str = "hand.yaml";
+    /// The attached URDF.
+    pub const URDF_NAME: &str = "hand.urdf";
+
     /// The files to attach, by name.
     pub(super) fn files(&self) -> [(&str, &[u8]); 2] {
-        [("hand.yaml", self.layout.as_bytes()), ("hand.urdf", self.urdf.as_bytes())]
+        [(Self::LAYOUT_NAME, self.layout.as_bytes()), (Self::URDF_NAME, self.urdf.as_bytes())]
     }
 }
 

@@ -14,7 +14,7 @@ use blindgrasp_messages::{Header, Record, Recorded, Stamped, TactileFrame, with_
 
 use super::source::with_cause;
 use super::types::{MESSAGE_ENCODING, SCHEMA_ENCODING, encode};
-use super::viewer::{ShownHand, StandardType, ViewerMessages};
+use super::viewer::{ForViewers, JOINT_STATES, ShownHand, StandardType, ViewerMessages};
 use super::{LIBRARY, METADATA_NAME, RecordingError, RecordingInfo};
 
 /// An open recording. The same records give the same bytes.
@@ -63,7 +63,17 @@ impl RecordingWriter {
             .map_err(|error| write_error(path, error))
     }
 
-    /// Attaches the files of a hand. Viewers can draw it with the frames of [`RecordingWriter::write_frame`].
+    /// Attaches a file.
+    ///
+    /// # Errors
+    /// The file cannot be written.
+    pub fn attach(&mut self, attachment: &Attachment<'_>) -> Result<(), RecordingError> {
+        let Some(writer) = &mut self.writer else { return Ok(()) };
+        writer.attach(attachment).map_err(|error| write_error(&self.path, error))
+    }
+
+    /// Attaches the files of a hand. Viewers can draw it with the frames of [`RecordingWriter::write_frame`], and its contacts
+    /// with those of [`RecordingWriter::write_record`].
     ///
     /// # Errors
     /// The file cannot be written.
@@ -82,15 +92,9 @@ impl RecordingWriter {
     /// As [`RecordingWriter::write`].
     pub fn write_frame(&mut self, topic: &str, frame: &Stamped<TactileFrame>) -> Result<(), RecordingError> {
         self.write(topic, frame)?;
-        let messages = self.viewer.of_frame(topic, frame, self.standard_channels.is_empty());
-        let messages = messages.map_err(|message| RecordingError::Invalid { path: self.path.clone(), message })?;
-        let Some(writer) = &mut self.writer else { return Ok(()) };
-        for (standard, data) in messages {
-            add_standard(writer, &mut self.standard_channels, standard)
-                .and_then(|id| append(writer, id, &frame.header, &data))
-                .map_err(|error| write_error(&self.path, error))?;
-        }
-        Ok(())
+        let is_first = !self.standard_channels.contains_key(JOINT_STATES.topic);
+        let messages = self.viewer.of_frame(topic, frame, is_first);
+        self.write_for_viewers(&frame.header, messages)
     }
 
     /// Appends a sample to a topic.
@@ -110,7 +114,15 @@ impl RecordingWriter {
     /// # Errors
     /// As [`RecordingWriter::write`].
     pub fn write_record(&mut self, topic: &str, record: &Record) -> Result<(), RecordingError> {
-        with_sample!(record, sample => self.write(topic, sample))
+        match record {
+            Record::Tactile(frame) => self.write_frame(topic, frame),
+            Record::Contacts(contacts) if self.viewer.hand.is_some() => {
+                self.write(topic, contacts)?;
+                let messages = self.viewer.of_contacts(topic, contacts);
+                self.write_for_viewers(&contacts.header, messages)
+            }
+            _ => with_sample!(record, sample => self.write(topic, sample)),
+        }
     }
 
     /// Adds metadata under a name of its own, beside the recording's [`RecordingInfo`].
@@ -135,6 +147,21 @@ impl RecordingWriter {
         }
         let channels = std::mem::take(&mut self.channels);
         Ok(channels.into_iter().map(|(topic, channel)| (topic, channel.n_samples)).collect())
+    }
+
+    fn write_for_viewers(
+        &mut self,
+        header: &Header,
+        messages: Result<ForViewers, String>,
+    ) -> Result<(), RecordingError> {
+        let messages = messages.map_err(|message| RecordingError::Invalid { path: self.path.clone(), message })?;
+        let Some(writer) = &mut self.writer else { return Ok(()) };
+        for (standard, data) in messages {
+            add_standard(writer, &mut self.standard_channels, standard)
+                .and_then(|id| append(writer, id, header, &data))
+                .map_err(|error| write_error(&self.path, error))?;
+        }
+        Ok(())
     }
 
     fn append<M: Recorded>(&mut self, topic: &str, sample: &Stamped<M>) -> mcap::McapResult<()> {

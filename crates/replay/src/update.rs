@@ -8,7 +8,9 @@ use super::comparison::Coverage;
 use super::played::is_played;
 use super::rewrite::{FedEdge, Origin};
 use blindgrasp_messages::with_sample;
-use blindgrasp_recording::{Record, RecordingError, RecordingReader, RecordingWriter, TOPICS_FOR_VIEWERS};
+use blindgrasp_recording::{
+    Attachment, Record, RecordingError, RecordingReader, RecordingWriter, ShownHand, TOPICS_FOR_VIEWERS, attachments,
+};
 
 /// Why a recording cannot be updated.
 #[derive(Debug, thiserror::Error)]
@@ -22,8 +24,8 @@ pub enum UpdateError {
 }
 
 /// Writes the recording anew and says what it wrote. The edges of the replay take the place of the recorded ones; the
-/// played topic, labels, scenes, metadata, and the edges of stages that did not run stay. Topics for viewers are left out:
-/// they follow from the samples.
+/// played topic, labels, scenes, metadata, attachments, and the edges of stages that did not run stay. Topics for viewers are
+/// written anew for the recording's hand, if it is attached: then they are ours.
 ///
 /// # Errors
 /// See [`UpdateError`].
@@ -33,10 +35,14 @@ pub fn update(
     played_topic: &str,
     edges: &[FedEdge],
     coverage: &Coverage,
+    hand: Option<ShownHand>,
 ) -> Result<String, UpdateError> {
     let reader = RecordingReader::open(recording)?;
+    let attachments = attachments(recording)?;
+    let hand = hand.filter(|_| attachments.iter().any(|file| file.name == ShownHand::URDF_NAME));
     let is_lost = |(topic, schema): &(&String, &String)| {
-        !schema.starts_with("blindgrasp_msgs/") && !TOPICS_FOR_VIEWERS.contains(&topic.as_str())
+        let is_made_anew = hand.is_some() && TOPICS_FOR_VIEWERS.contains(&topic.as_str());
+        !schema.starts_with("blindgrasp_msgs/") && !is_made_anew
     };
     if let Some((topic, schema)) = reader.topics().iter().find(is_lost) {
         return Err(UpdateError::OtherTopic { topic: topic.clone(), schema: schema.clone() });
@@ -53,11 +59,7 @@ pub fn update(
             Err(error) => Some(Err(error)),
         })
         .peekable();
-    let metadata = reader.all_metadata().clone();
-    let mut writer = RecordingWriter::create(recording, reader.info())?;
-    for (name, metadata) in metadata {
-        writer.write_metadata(&name, metadata)?;
-    }
+    let mut writer = begin(recording, &reader, &attachments, hand)?;
     for record in reader {
         let (topic, record) = record?;
         if replaced.contains(topic.as_str()) {
@@ -71,6 +73,29 @@ pub fn update(
     copy(&mut new_samples, &mut writer, None)?;
     let written: Vec<String> = writer.finish()?.iter().map(|(topic, n)| format!("{topic} {n}")).collect();
     Ok(format!("updated: {}", written.join(", ")))
+}
+
+/// Begins the new recording with the metadata and attachments of the old one.
+fn begin(
+    recording: &Path,
+    reader: &RecordingReader,
+    attachments: &[Attachment<'_>],
+    hand: Option<ShownHand>,
+) -> Result<RecordingWriter, RecordingError> {
+    let mut writer = RecordingWriter::create(recording, reader.info())?;
+    for (name, metadata) in reader.all_metadata() {
+        writer.write_metadata(name, metadata.clone())?;
+    }
+    for file in attachments {
+        // The hand's own files are attached with it.
+        if hand.is_none() || ![ShownHand::LAYOUT_NAME, ShownHand::URDF_NAME].contains(&file.name.as_str()) {
+            writer.attach(file)?;
+        }
+    }
+    if let Some(hand) = hand {
+        writer.show(hand)?;
+    }
+    Ok(writer)
 }
 
 /// Copies the samples that are older than `before_nanos`; all samples if it is `None`.
@@ -97,4 +122,62 @@ fn with_recorded_number(mut record: Record, coverage: &Coverage) -> Record {
         with_sample!(&mut record, sample => sample.header.seq = coverage.recorded_seq(&sample.header));
     }
     record
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+    use std::sync::Arc;
+
+    use super::*;
+    use blindgrasp_messages::{ContactSet, Header, Stamped, TactileFrame};
+    use blindgrasp_recording::{LiveOptions, LiveRecorder, RecordingInfo};
+
+    fn hand() -> ShownHand {
+        ShownHand {
+            joint_names: Vec::new(),
+            layout: "name: h".into(),
+            urdf: "<robot/>".into(),
+            link_poses: Arc::new(|_| Vec::new()),
+        }
+    }
+
+    /// A recording of a graph, written anew without another sample.
+    fn updated(path: &Path, hand: Option<ShownHand>) -> Result<String, UpdateError> {
+        let coverage = Coverage::of(path, "/tactile").expect("covered");
+        update(path, path, "/tactile", &[], &coverage, hand)
+    }
+
+    #[test]
+    fn an_update_keeps_attachments_and_topics_for_viewers_and_drops_no_foreign_topic() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("run.mcap");
+        let record = |hand: Option<ShownHand>| {
+            let info = RecordingInfo { hand: "h".into(), hand_id: 1, made_by: "a test".into(), version: "0".into() };
+            let attachments = BTreeMap::from([("model.json".to_string(), b"{}".to_vec())]);
+            let options = LiveOptions { hand, attachments, overwrite: true, ..LiveOptions::default() };
+            let mut recorder = LiveRecorder::create(&path, &info, options).expect("created");
+            let header = Header::default();
+            let frame = Record::Tactile(Stamped { header, message: TactileFrame::default() });
+            let contacts = Record::Contacts(Stamped { header, message: ContactSet::default() });
+            recorder.write("/tactile", &frame).expect("written");
+            recorder.write("/contacts", &contacts).expect("written");
+            recorder.finish().expect("finished");
+        };
+        record(Some(hand()));
+        let topics = || RecordingReader::open(&path).expect("opened").topics().clone();
+        let (before, attached) = (topics(), attachments(&path).expect("read"));
+        assert_eq!((before.len(), attached.len()), (2 + TOPICS_FOR_VIEWERS.len(), 3));
+        updated(&path, Some(hand())).expect("updated");
+        assert_eq!(topics(), before);
+        let found = attachments(&path).expect("read");
+        assert!(found.iter().all(|file| attached.contains(file)) && found.len() == 3, "{found:?}");
+        // Without the hand they would be lost, and of a recording without the files of its hand they may be a robot's own.
+        let refused = updated(&path, None).expect_err("a hand is missing").to_string();
+        assert!(refused.contains("/contact_points") && refused.contains("would be lost"), "{refused}");
+        record(None);
+        let refused = updated(&path, Some(hand())).expect_err("a foreign topic").to_string();
+        assert!(refused.contains("/contact_points") && refused.contains("would be lost"), "{refused}");
+        assert_eq!(attachments(&path).expect("read").len(), 1);
+    }
 }

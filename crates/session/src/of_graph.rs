@@ -32,6 +32,7 @@ pub fn of_graph(
     let hand = param(graph, "hand").next().map(|(_, path)| Hand::load(Path::new(path))).transpose()?;
     let began = if is_at_start { "start" } else { "attached" };
     let versions = nodes(graph).filter_map(|node| Some((node["id"].as_str()?.to_string(), node["version"].clone())));
+    let (models, attachments) = models(graph);
     let about = BTreeMap::from([
         ("name".into(), name.into()),
         ("began".into(), began.into()),
@@ -39,7 +40,7 @@ pub fn of_graph(
         ("blindgrasp_version".into(), env!("CARGO_PKG_VERSION").into()),
         ("graph".into(), graph.to_string()),
         ("operator_versions".into(), Value::Object(versions.collect()).to_string()),
-        ("models".into(), models(graph).to_string()),
+        ("models".into(), models.to_string()),
     ]);
     let mut metadata = BTreeMap::from([(GRAPH_METADATA.into(), about)]);
     if let Some(label) = label(graph) {
@@ -51,12 +52,6 @@ pub fn of_graph(
         made_by: format!("graph {name}"),
         version: env!("CARGO_PKG_VERSION").into(),
     };
-    let mut attachments = BTreeMap::new();
-    for (node, path) in param(graph, "model") {
-        if let Ok(model) = std::fs::read(path) {
-            attachments.insert(format!("model of {node}.json"), model);
-        }
-    }
     Ok((info, LiveOptions { hand: hand.as_ref().map(shown_hand), attachments, metadata, ..options }))
 }
 
@@ -76,15 +71,23 @@ fn label(graph: &Value) -> Option<Label> {
     })
 }
 
-/// The models of a graph's nodes: where they lie and which they are. What is no model of ours has nothing but its path.
-fn models(graph: &Value) -> Value {
-    let model = |(node, path): (&str, &str)| {
-        let known = Model::load(Path::new(path)).ok().map(
-            |model| json!({"path": path, "dictionary_id": format!("{:016x}", model.dictionary_id()), "checksum": model.checksum}),
-        );
-        (node.to_string(), known.unwrap_or_else(|| json!({ "path": path })))
-    };
-    Value::Object(param(graph, "model").map(model).collect::<Map<_, _>>())
+/// The models of a graph's nodes: where they lie and which they are, and the files of our own, each once. What is no model of ours
+/// has nothing but its path.
+fn models(graph: &Value) -> (Value, BTreeMap<String, Vec<u8>>) {
+    let (mut models, mut files) = (Map::new(), BTreeMap::new());
+    for (node, path) in param(graph, "model") {
+        let mut about = json!({ "path": path });
+        // Several nodes may have one model.
+        if let Some(known) = models.values().find(|known| known["path"] == path) {
+            about = known.clone();
+        } else if let Ok(model) = Model::load(Path::new(path)) {
+            about["dictionary_id"] = format!("{:016x}", model.dictionary_id()).into();
+            about["checksum"] = model.checksum.into();
+            files.extend(std::fs::read(path).map(|file| (format!("model of {node}.json"), file)));
+        }
+        models.insert(node.into(), about);
+    }
+    (models.into(), files)
 }
 
 /// The nodes of a graph.
@@ -95,4 +98,23 @@ pub fn nodes(graph: &Value) -> impl Iterator<Item = &Value> {
 /// The nodes that have a parameter of that name, and its value as text.
 fn param<'a>(graph: &'a Value, name: &'static str) -> impl Iterator<Item = (&'a str, &'a str)> {
     nodes(graph).filter_map(move |node| Some((node["id"].as_str()?, node["params"][name].as_str()?)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn models_of_ours_are_attached_once_and_no_other_file() {
+        let model = concat!(env!("CARGO_MANIFEST_DIR"), "/../../models/barrett-bh8-280.json");
+        let other = concat!(env!("CARGO_MANIFEST_DIR"), "/Cargo.toml");
+        let node = |id: &str, path: &str| json!({"id": id, "params": {"model": path}});
+        let graph = json!({"nodes": [node("torch", other), node("encoder", model), node("classifier", model)]});
+        let (_, options) = of_graph(&graph, true, LiveOptions::default()).expect("described");
+        let file = std::fs::read(model).expect("a model");
+        assert_eq!(options.attachments, BTreeMap::from([("model of encoder.json".to_string(), file)]));
+        let models: Value = serde_json::from_str(&options.metadata[GRAPH_METADATA]["models"]).expect("JSON");
+        assert_eq!(models["classifier"], models["encoder"]);
+        assert!(models["encoder"]["checksum"].is_string() && models["torch"] == json!({ "path": other }), "{models}");
+    }
 }

@@ -64,7 +64,7 @@ pub struct TrainingSummary {
     pub own_lifts: Option<OwnLiftsSummary>,
 }
 
-/// The lifts of one robot that corrected a model, and the figures of the corrected model.
+/// The lifts of a robot, or of several of one hand, that corrected a model, and the figures of the corrected model.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct OwnLiftsSummary {
@@ -88,11 +88,24 @@ pub struct OwnLiftsSummary {
     pub n_lifted: usize,
     /// Grasps that a limit of the model's training range held before; 0 if the limits are those of the model.
     pub n_outside: usize,
-    /// The bounds of drops of this robot; `None` if no lift is made.
+    /// The bounds of drops of these lifts; `None` if no lift is made.
     pub promise: Option<Promise>,
+    /// The share of each robot, by its name; empty for one robot.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub robots: BTreeMap<String, RobotLifts>,
     /// Whether some of the lifts are simulated. Models of earlier versions do not say so.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub in_simulation: bool,
+}
+
+/// The lifts of one robot among those that corrected a model, as [`OwnLiftsSummary`] has them for all.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RobotLifts {
+    pub n_lifts: usize,
+    pub n_kept: usize,
+    pub n_lifted: usize,
+    pub promise: Option<Promise>,
 }
 
 impl TrainingSummary {

@@ -1,6 +1,6 @@
 //! `blindgrasp model`
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 use clap::{Args, Subcommand};
@@ -19,7 +19,7 @@ use blindgrasp_stages::day::{Baseline, DayMethod};
 use blindgrasp_stages::model::Model;
 use blindgrasp_stages::own_lifts::Correction;
 use blindgrasp_stages::probe::ProbeModel;
-use blindgrasp_stages::training_summary::{OwnLiftsSummary, PolicySummary, ThresholdPoint};
+use blindgrasp_stages::training_summary::{OwnLiftsSummary, PolicySummary, Promise, RobotLifts, ThresholdPoint};
 
 /// Describe or adapt a model, or rate approaches
 #[derive(Debug, Args)]
@@ -40,11 +40,12 @@ enum Command {
 /// Recordings of lifts that end with a frame of the phase kept or dropped correct the probabilities of the look that decides, and
 /// widen limits that held the robot's own grasps. Objects are the unit of the cross-fit. A model that looks at days
 /// (--day-baseline, import --day) is corrected for the day of the recordings; other days are judged as before. The thresholds stay.
+/// Outcomes of several robots of one hand are pooled, and each robot's share is shown by the name of its file or folder.
 /// Use the new model in place of the old one: blindgrasp run --set model=NEW, or blindgrasp swap.
 #[derive(Debug, Args)]
-#[command(
-    after_help = "Example: blindgrasp model adapt models/barrett-bh8-280-lifts.json my-lifts.mcap --out mine.json"
-)]
+#[command(after_help = "Examples:\n  \
+                        blindgrasp model adapt models/barrett-bh8-280-lifts.json my-lifts.mcap --out mine.json\n  \
+                        blindgrasp model adapt gate.json robot-a.mcap robot-b.mcap robot-c/ --out fleet.json")]
 struct AdaptArguments {
     /// The model.
     model: PathBuf,
@@ -93,11 +94,26 @@ fn adapt_model(arguments: &AdaptArguments) -> anyhow::Result<Outcome> {
     let hand = hand_of(first, arguments.hand.as_deref())?;
     let inputs = [recordings.as_slice(), std::slice::from_ref(&arguments.model)].concat();
     check_new(&arguments.out, &inputs, arguments.overwrite)?;
-    let model = adapt(&hand, &Model::load(&arguments.model)?, &recordings)?;
+    let robots: Vec<String> = recordings.iter().map(|path| robot_of(path, &arguments.recordings)).collect();
+    let model = adapt(&hand, &Model::load(&arguments.model)?, &recordings, &robots)?;
     model.save(&arguments.out)?;
     let lines: Vec<String> = recalibration_line(&model).into_iter().chain(own_lifts_lines(&model)).collect();
     print_text(&format!("{}: {}", arguments.out.display(), lines.join("\n")))?;
     Ok(Outcome::Done)
+}
+
+/// The name of the robot of a recording: that of the file, without the number of a part, or of the folder that was named.
+fn robot_of(recording: &Path, named: &[PathBuf]) -> String {
+    if !named.iter().any(|path| path == recording)
+        && let Some(folder) = recording.parent().and_then(Path::file_name)
+    {
+        return folder.to_string_lossy().into_owned();
+    }
+    let stem = recording.file_stem().unwrap_or_default().to_string_lossy();
+    match stem.rsplit_once('-') {
+        Some((name, number)) if number.len() == 5 && number.bytes().all(|byte| byte.is_ascii_digit()) => name.into(),
+        _ => stem.into_owned(),
+    }
 }
 
 fn day_line(model: &Model) -> Option<String> {
@@ -131,7 +147,11 @@ fn own_lifts_lines(model: &Model) -> Vec<String> {
         let (a, b) = (correction.a, correction.b.abs());
         format!("when {}, log-odds are {a:.3} x those of the model {sign} {b:.3} ({losses})", own.look)
     };
-    let world = if own.in_simulation { "in simulation" } else { "on this robot" };
+    let world = match own {
+        OwnLiftsSummary { in_simulation: true, .. } => "in simulation",
+        OwnLiftsSummary { robots, .. } if robots.is_empty() => "on this robot",
+        _ => "on these robots",
+    };
     let mut lines = vec![format!(
         "by {} of {} {world}, {n_kept} kept: {corrected}",
         counted(n_lifts, "lift"),
@@ -149,6 +169,14 @@ fn own_lifts_lines(model: &Model) -> Vec<String> {
         Some(promise) => format!("of these lifts it makes {}; promised {world}: {promise}", own.n_lifted),
         None => "of these lifts it makes none".into(),
     });
+    for (robot, RobotLifts { n_lifts, n_kept, n_lifted, promise }) in &own.robots {
+        let mut line = format!("{robot}: {}, {n_kept} kept; it makes {n_lifted}", counted(n_lifts, "lift"));
+        if let Some(Promise { confidence, drops_of_lifts: drops, .. }) = promise {
+            let [at_most, confidence] = [drops.at_most, *confidence].map(|share| percent(Some(share)));
+            line += &format!(", of which at most {at_most} drop ({confidence} confidence)");
+        }
+        lines.push(line);
+    }
     lines
 }
 
@@ -383,6 +411,15 @@ fn trees_json(trees: &BoostedTrees) -> serde_json::Value {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_robot_is_named_by_its_file_or_folder() {
+        let named = ["days/robot-a.mcap", "robot-b-00001.mcap", "robots/c/"].map(PathBuf::from);
+        let robot = |path: &str| robot_of(Path::new(path), &named);
+        assert_eq!(robot("days/robot-a.mcap"), "robot-a");
+        assert_eq!(robot("robot-b-00001.mcap"), "robot-b");
+        assert_eq!(robot("robots/c/2026-11-29.mcap"), "c");
+    }
 
     #[test]
     fn the_price_of_a_drop_chooses_a_point_of_the_curve() {

@@ -9,6 +9,7 @@ use rayon::prelude::*;
 use serde::Serialize;
 use serde_json::json;
 
+use super::faults::hand_of;
 use super::scratch::Scratch;
 use super::settings;
 use crate::commands::replay::{Fed, Feed};
@@ -16,6 +17,7 @@ use blindgrasp_cli::graph_file::{OnMisfit, fitting};
 use blindgrasp_graph::dataflow::{self, Graph, Override};
 use blindgrasp_graph::launcher::LaunchOptions;
 use blindgrasp_graph::run::{RunSummary, observed_topics};
+use blindgrasp_grasps::shown_hand::shown_hand;
 use blindgrasp_messages::{LiftDecision, Recorded};
 use blindgrasp_operator::text::counted;
 use blindgrasp_operator::wiring::Clock;
@@ -115,7 +117,9 @@ impl Runner<'_> {
             case.notes.extend(settings::differing(&RecordingReader::open(&recording)?, &graph));
         }
         if is_update && !has_lost {
-            case.notes.push(update(&recording, &found, &fed.topic, &fed.edges, &coverage)?);
+            let hand_id = RecordingReader::open(&recording)?.info().hand_id;
+            let hand = hand_of(&graph).ok().filter(|hand| hand.id() == hand_id).as_ref().map(shown_hand);
+            case.notes.push(update(&recording, &found, &fed.topic, &fed.edges, &coverage, hand)?);
         }
         let deciders = fed.graph.nodes.iter().flat_map(|node| node.outputs());
         if deciders.filter(|output| output.type_name == LiftDecision::TYPE_NAME).count() > 1 {

@@ -75,7 +75,7 @@ pub(super) fn run(runner: &Runner<'_>, recordings: &[PathBuf], is_json: bool) ->
 }
 
 /// The hand of the graph's first node that names one.
-fn hand_of(graph: &Graph) -> anyhow::Result<Hand> {
+pub(super) fn hand_of(graph: &Graph) -> anyhow::Result<Hand> {
     let path = graph.nodes.iter().find_map(|node| node.params.get("hand")?.as_str().map(PathBuf::from));
     let path = path.with_context(|| format!("no node of graph '{}' names the hand", graph.name))?;
     Ok(Hand::load(&path)?)

@@ -12,7 +12,6 @@ use nalgebra::{DMatrix, DVector};
 
 use super::probes::reading_at;
 use super::{Example, Examples, LOOKS, N_FOLDS, TrainingError, folds_by_object, values_at};
-use crate::file_name;
 use crate::learners::decision_values;
 use crate::learners::training_range::learn_training_range;
 use crate::promise::{ObjectTrials, promise};
@@ -28,7 +27,7 @@ use blindgrasp_stages::own_lifts::{
     Correction, FEWEST_OUTCOMES, Learned, OF_A_ROBOT, OF_AN_UNLIKE_ROBOT, Prior, log_loss, log_odds_of, probability,
     secs_per_kept,
 };
-use blindgrasp_stages::training_summary::{OwnLiftsSummary, Promise};
+use blindgrasp_stages::training_summary::{OwnLiftsSummary, Promise, RobotLifts};
 
 /// The fewest labelled grasps of a day.
 const MIN_LABELLED: usize = 20;
@@ -38,20 +37,20 @@ const UNLIKE_SHARE: f64 = 0.1;
 /// Own grasps without which no limit is widened.
 const FEWEST_FOR_LIMITS: usize = 30;
 
-/// The model, corrected by the labelled grasps of recordings: lifts of one robot, or grasps of one day for a model that looks at
-/// days. The grasps count as trained on.
+/// The model, corrected by the labelled grasps of recordings: lifts of robots of one hand, or grasps of one day for a model
+/// that looks at days. The grasps count as trained on. `robots` names the robot of each recording.
 ///
 /// # Errors
 /// Recordings that cannot be used, whose label is the paper's, that the model was trained on, or with too few labelled grasps.
-pub fn adapt(hand: &Hand, model: &Model, recordings: &[PathBuf]) -> Result<Model, TrainingError> {
-    adapt_on(hand, model, &Examples::read(hand, recordings, |_, _| {})?, recordings)
+pub fn adapt(hand: &Hand, model: &Model, recordings: &[PathBuf], robots: &[String]) -> Result<Model, TrainingError> {
+    adapt_on(hand, model, &Examples::read(hand, recordings, |_, _| {})?, robots)
 }
 
-/// Corrects a model by examples. `recordings` names the files that they are from; it is empty for examples out of memory.
+/// Corrects a model by examples. `robots` names the robot of each recording that they are from; it may be empty if there is one.
 ///
 /// # Errors
 /// As of [`adapt`].
-pub fn adapt_on(hand: &Hand, model: &Model, read: &Examples, recordings: &[PathBuf]) -> Result<Model, TrainingError> {
+pub fn adapt_on(hand: &Hand, model: &Model, read: &Examples, robots: &[String]) -> Result<Model, TrainingError> {
     if model.hand.id != hand.id() {
         return refused(format!("the recordings are of the hand '{}', the model of '{}'", hand.name, model.hand.name));
     }
@@ -68,7 +67,7 @@ pub fn adapt_on(hand: &Hand, model: &Model, read: &Examples, recordings: &[PathB
     }
     let mut adapted = match &model.day {
         Some(day) => adapt_to_day(model, day, read)?,
-        None => adapt_to_lifts(hand, model, read, recordings)?,
+        None => adapt_to_lifts(hand, model, read, robots)?,
     };
     // They were for the probabilities before.
     adapted.training.withdraw_promises();
@@ -90,7 +89,7 @@ struct JudgedLift<'a> {
     log_odds: f64,
 }
 
-fn adapt_to_lifts(hand: &Hand, model: &Model, read: &Examples, recordings: &[PathBuf]) -> Result<Model, TrainingError> {
+fn adapt_to_lifts(hand: &Hand, model: &Model, read: &Examples, robots: &[String]) -> Result<Model, TrainingError> {
     let Some((look, classifier)) = deciding_look(model, &read.examples) else {
         return refused("no grasp with an outcome has frames that the model decides by: record whole grasps".into());
     };
@@ -130,19 +129,21 @@ fn adapt_to_lifts(hand: &Hand, model: &Model, read: &Examples, recordings: &[Pat
         (of_look.calibration, of_look.threshold_probability, of_look.unsure_from_probability) =
             own.learned.apply(classifier);
     }
+    let of_all = summed_up(&lifts, &own.is_lifted, |_| true);
     adapted.training.own_lifts = Some(OwnLiftsSummary {
-        recordings: recordings.iter().map(|path| file_name(path)).collect(),
+        recordings: read.recordings.clone(),
         look: look.as_str().into(),
-        n_lifts: lifts.len(),
-        n_kept: examples.iter().filter(|example| example.stable).count(),
+        n_lifts: of_all.n_lifts,
+        n_kept: of_all.n_kept,
         taught_nothing,
         n_objects,
         correction: own.learned.correction,
         log_loss_before: own.log_losses[0],
         log_loss_after: own.log_losses[1],
-        n_lifted: own.n_lifted,
+        n_lifted: of_all.n_lifted,
         n_outside: if is_unlike { n_outside } else { 0 },
-        promise: own.promise,
+        promise: of_all.promise,
+        robots: by_robot(&lifts, &own.is_lifted, robots),
         in_simulation: !read.labels.is_empty(),
     });
     Ok(adapted)
@@ -197,9 +198,8 @@ struct Own {
     learned: Learned,
     /// The mean log loss of the model and of the corrected model, nats.
     log_losses: [f64; 2],
-    /// Of the lifts, those that would be made.
-    n_lifted: usize,
-    promise: Option<Promise>,
+    /// Whether each of the lifts would be made.
+    is_lifted: Vec<bool>,
 }
 
 impl Judged<'_> {
@@ -220,22 +220,7 @@ impl Judged<'_> {
             (true, false) => (self.at_the_same_place(learned), before),
             (false, _) => (of_model, before),
         };
-        let mut of_objects: BTreeMap<&String, [f64; 3]> = BTreeMap::new();
-        for (lift, is_lifted) in self.lifts.iter().zip(&tried.is_lifted) {
-            let [n, lifted, dropped] = of_objects.entry(&lift.example.object).or_default();
-            *n += 1.0;
-            *lifted += f64::from(u8::from(*is_lifted));
-            *dropped += f64::from(u8::from(*is_lifted && !lift.example.stable));
-        }
-        let trials =
-            of_objects.values().map(|[n, lifted, dropped]| ObjectTrials { lifted: lifted / n, dropped: dropped / n });
-        Own {
-            learned,
-            log_losses,
-            n_lifted: tried.is_lifted.iter().filter(|is_lifted| **is_lifted).count(),
-            // Each grasp counts as a trial of its own.
-            promise: promise(&trials.collect::<Vec<_>>()).map(|promise| Promise { n_attempts: Some(1), ..promise }),
-        }
+        Own { learned, log_losses, is_lifted: tried.is_lifted }
     }
 
     /// Learns from those of the lifts that are used.
@@ -282,6 +267,39 @@ struct Tried {
     log_loss: f64,
     secs_per_kept: f64,
     is_lifted: Vec<bool>,
+}
+
+/// Sums up some of the lifts. Objects are the unit of the bounds, whichever robot lifts them.
+fn summed_up(lifts: &[JudgedLift], is_lifted: &[bool], is_counted: impl Fn(&Example) -> bool) -> RobotLifts {
+    let mut of_objects: BTreeMap<&String, [usize; 4]> = BTreeMap::new();
+    for (JudgedLift { example, .. }, is_lifted) in lifts.iter().zip(is_lifted) {
+        if is_counted(example) {
+            let [n, n_kept, n_lifted, n_dropped] = of_objects.entry(&example.object).or_default();
+            *n += 1;
+            *n_kept += usize::from(example.stable);
+            *n_lifted += usize::from(*is_lifted);
+            *n_dropped += usize::from(*is_lifted && !example.stable);
+        }
+    }
+    let mut trials = Vec::new();
+    for [n, _, n_lifted, n_dropped] in of_objects.values() {
+        let share = |count: &usize| *count as f64 / *n as f64;
+        trials.push(ObjectTrials { lifted: share(n_lifted), dropped: share(n_dropped) });
+    }
+    let [n_lifts, n_kept, n_lifted] = [0, 1, 2].map(|idx| of_objects.values().map(|counts| counts[idx]).sum());
+    // Each grasp counts as a trial of its own.
+    let promise = promise(&trials).map(|promise| Promise { n_attempts: Some(1), ..promise });
+    RobotLifts { n_lifts, n_kept, n_lifted, promise }
+}
+
+/// Sums up the lifts of each robot, if there are several.
+fn by_robot(lifts: &[JudgedLift], is_lifted: &[bool], robots: &[String]) -> BTreeMap<String, RobotLifts> {
+    let mut by_robot = BTreeMap::new();
+    for robot in robots {
+        let of_robot = summed_up(lifts, is_lifted, |example| robots[example.recording_idx] == *robot);
+        by_robot.insert(robot.clone(), of_robot);
+    }
+    if by_robot.len() > 1 { by_robot } else { BTreeMap::new() }
 }
 
 /// Whether the model calls a grasp unstable at a look before the one that decides.
@@ -424,4 +442,34 @@ fn judged(model: &Model, method: &DayMethod, examples: &[Example]) -> Result<Day
     let decision_values = decision_values(&model.classifier.predictor, &scaled)?;
     let log_odds = decision_values.iter().map(|value| model.classifier.log_odds(*value)).collect();
     Ok(DayGrasps { rows, log_odds, stable, statistics })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::promise::least_bound;
+
+    #[test]
+    fn lifts_of_a_fleet_are_summed_up_by_robot_and_together() {
+        // Two recordings of one robot with 20 lifts each, and one of another, which drops five of 20 and would not make the last.
+        let example = |idx: usize| Example {
+            recording_idx: idx / 20,
+            stable: idx < 40 || idx % 4 != 0,
+            object: idx.to_string(),
+            ..Example::default()
+        };
+        let examples: Vec<Example> = (0..60).map(example).collect();
+        let lifts: Vec<JudgedLift> = examples.iter().map(|example| JudgedLift { example, log_odds: 0.0 }).collect();
+        let is_lifted: Vec<bool> = (0..60).map(|idx| idx < 59).collect();
+        let robots = |names: [&str; 3]| by_robot(&lifts, &is_lifted, &names.map(String::from));
+        let found = robots(["a", "a", "b"]);
+        let counts = |of: &RobotLifts| (of.n_lifts, of.n_kept, of.n_lifted);
+        assert_eq!((counts(&found["a"]), counts(&found["b"])), ((40, 40, 40), (20, 15, 19)));
+        let at_most = |of: &RobotLifts| of.promise.expect("lifts").drops_of_lifts.at_most;
+        let fleet = summed_up(&lifts, &is_lifted, |_| true);
+        assert_eq!(counts(&fleet), (60, 55, 59));
+        assert!((at_most(&found["a"]) - least_bound(40)).abs() < 1e-9);
+        assert!(at_most(&found["a"]) < at_most(&fleet) && at_most(&fleet) < at_most(&found["b"]), "{found:?}");
+        assert!(robots(["a", "a", "a"]).is_empty(), "one robot");
+    }
 }

@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use super::TrainingError;
+use crate::file_name;
 use blindgrasp_grasps::dataset::{DatasetError, Grasp, check_once, label_of, read_grasps};
 use blindgrasp_grasps::reading::{Felt, SeenReadings, Settled, check_classes, note_reading};
 use blindgrasp_messages::{Contact, Fault, GraspTruth, OwnedSenses, Phase, Stamped, TactileFrame};
@@ -91,6 +92,8 @@ pub struct Examples {
     pub unfelt: Vec<(usize, GraspTruth)>,
     /// All grasps, those left out as well: the index of the recording and the number in it.
     pub grasps: BTreeSet<(usize, u64)>,
+    /// The name of each recording's file.
+    pub recordings: Vec<String>,
     /// The program and options that made each recording, from its metadata.
     pub made_by: Vec<String>,
     /// Number of simulated recordings for each meaning of "stable".
@@ -130,6 +133,7 @@ impl Examples {
         if let Some(label) = label_of(path, &reader)? {
             *self.labels.entry(label).or_default() += 1;
         }
+        self.recordings.push(file_name(path));
         self.made_by.push(reader.info().made_by.clone());
         let grasps = read_grasps(path, hand, |_, frames| FeltGrasp::of(hand, frames))?;
         self.add_grasps(grasps, recording_idx, seen);
