@@ -9,7 +9,7 @@
 //! that of the training: another skin or gear reads them otherwise, and the grasp is the same. docs/trust.md says what
 //! this finds. Distances in the space of all quantities (Mahalanobis, nearest neighbours, K-means) found less.
 //!
-//! Pure: no clock, no I/O, no state, and no allocation in [`TrainingRange::check`].
+//! Pure: no clock, no I/O, no state, and no allocation for a frame within the limits.
 
 use std::fmt;
 use std::ops::RangeInclusive;
@@ -117,11 +117,7 @@ impl TrainingRange {
     /// # Errors
     /// [`Fault::OutOfDistribution`].
     pub fn check(&self, features: &FeatureExtractor, joints: &[f64], contacts: &[Contact]) -> Result<(), Fault> {
-        let mut limits = self.limits.iter();
-        let mut is_within = true;
-        for_each_quantity(features, joints, contacts, |value| {
-            is_within &= limits.next().is_some_and(|limits| limits.allow(value));
-        });
+        let is_within = self.violations(features, joints, contacts).is_empty();
         if is_within { Ok(()) } else { Err(Fault::OutOfDistribution) }
     }
 
