@@ -146,6 +146,13 @@ pub enum InvalidModel {
     /// It has the format, but not what belongs to it.
     #[error("not a valid model: {0}")]
     Malformed(String),
+    /// The file is whole, and another program with the same format wrote it.
+    #[error(
+        "another build of blindgrasp, version {version}, wrote it, and this one, version {}, does not know its fields \
+         ({reason}): train it again with this one (blindgrasp train)",
+        env!("CARGO_PKG_VERSION")
+    )]
+    OtherBuild { version: String, reason: String },
     #[error("format '{found}', expected '{FORMAT}': train it again with this version (blindgrasp train)")]
     OtherFormat { found: String },
     #[error(
@@ -482,11 +489,24 @@ fn why_not_a_model(text: &str, error: &serde_json::Error) -> InvalidModel {
     #[derive(Deserialize)]
     struct AnyModel {
         format: String,
+        #[serde(default)]
+        checksum: String,
+        #[serde(default)]
+        training: serde_json::Value,
     }
-    match serde_json::from_str::<AnyModel>(text) {
-        Err(error) => InvalidModel::NotAModel(error.to_string()),
-        Ok(any) if any.format != FORMAT => InvalidModel::OtherFormat { found: any.format },
-        Ok(_) => InvalidModel::Malformed(error.to_string()),
+    let any: AnyModel = match serde_json::from_str(text) {
+        Ok(any) => any,
+        Err(error) => return InvalidModel::NotAModel(error.to_string()),
+    };
+    if any.format != FORMAT {
+        return InvalidModel::OtherFormat { found: any.format };
+    }
+    let reason = error.to_string();
+    match any.training["version"].as_str() {
+        Some(version) if any.checksum == checksum(text, &any.checksum) => {
+            InvalidModel::OtherBuild { version: version.into(), reason }
+        }
+        _ => InvalidModel::Malformed(reason),
     }
 }
 
@@ -583,6 +603,17 @@ mod tests {
         ] {
             let error = Model::parse(text).expect_err("no model").to_string();
             assert!(error.contains(expected), "{error}");
+        }
+        // A whole file with a field that this version does not know.
+        let shipped = include_str!("../../../models/barrett-bh8-280.json");
+        let (before, after) = shipped.rsplit_once(r#""checksum":""#).expect("a checksum");
+        let old = |checksum: &str| format!("{before}\"machine\":{{}},\"checksum\":\"{checksum}{}", &after[64..]);
+        for (checksum, expected) in [
+            (digest(&[&old("")]), "another build of blindgrasp, version 0.1.0, wrote it, and this one, version 0."),
+            ("0".repeat(64), "not a valid model: unknown field `machine`"),
+        ] {
+            let error = Model::parse(&old(&checksum)).expect_err("of another build").to_string();
+            assert!(error.contains(expected) && error.contains("unknown field `machine`"), "{error}");
         }
     }
 }

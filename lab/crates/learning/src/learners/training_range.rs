@@ -180,7 +180,6 @@ mod tests {
         let far = vec![contact(0, 0.1, 1.5), contact(3, 0.0, 1.0)];
         for (joints, contacts, named) in [
             (posture(2.4, 0.1), usual(), "position of joint finger_1,"),
-            (posture(1.0, -0.2), usual(), "breakaway of joint distal_1,"),
             (posture(1.0, 0.1), stuck, "greatest force on a cell of pad finger_1,"),
             (posture(1.0, 0.1), far, "greatest distance"),
             (posture(1.0, 0.1), vec![Contact { pad: 2, ..contact(0, 0.005, 1.5) }], "load of pad finger_2,"),
@@ -192,6 +191,37 @@ mod tests {
                 "{named}: {violations:?}"
             );
         }
+    }
+
+    #[test]
+    fn the_hand_bounds_contacts_and_breakaways_and_a_load_may_be_doubled() {
+        let features = extractor();
+        let mut range = range(&features, &grasps());
+        let limits = |range: &TrainingRange, quantity: &str| {
+            let is_of = |limits: &&Limits| limits.quantity.starts_with(quantity);
+            let limits = range.limits.iter().find(is_of).expect("a limit");
+            (limits.lower, limits.upper)
+        };
+        assert_eq!(limits(&range, "contacts of pad finger_1"), (0.0, 24.0));
+        let joints = barrett().joints;
+        let expected = (-45.0 / 140.0 * joints[1].upper, joints[4].upper);
+        assert_eq!(limits(&range, "breakaway of joint distal_1,"), expected);
+        // A file of an older version has the last values seen.
+        for limits in &mut range.limits {
+            if limits.quantity.starts_with("contacts of ") || limits.quantity.starts_with("breakaway of ") {
+                (limits.lower, limits.upper) = (0.0, 0.0);
+            }
+        }
+        let (_, most_newtons) = limits(&range, "load of pad finger_1,");
+        // The training had two contacts in each grasp: more of them bear more, and none more than one of these did.
+        let pressed = |n: usize| {
+            let cells = [0, 3].into_iter().cycle().take(n);
+            cells.map(|cell| contact(cell, 0.005, 0.45 * most_newtons)).collect::<Vec<_>>()
+        };
+        assert_eq!(range.check(&features, &posture(1.0, -0.2), &pressed(4)), Ok(()));
+        let violations = range.violations(&features, &posture(1.0, -0.2), &pressed(5));
+        assert_eq!(violations.len(), 1, "{violations:?}");
+        assert!(violations[0].to_string().starts_with("load of pad finger_1, newtons: "), "{violations:?}");
     }
 
     #[test]
