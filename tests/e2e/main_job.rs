@@ -379,7 +379,7 @@ fn a_model_of_another_hand_never_lifts() {
     std::fs::copy(crate::common::project().join("hands/barrett-bh8-280.urdf"), at("barrett-bh8-280.urdf"))
         .expect("copied");
     let (hand, recording, model) = (at("other.yaml"), at("other.mcap"), at("other.json"));
-    run(&["simulate", "--hand", &hand, "--grasps", "120", "--out", &recording], 0);
+    run(&["simulate", "--hand", &hand, "--objects", "box,mug", "--grasps", "120", "--out", &recording], 0);
     run(&["train", &recording, "--hand", &hand, "--words", "8", "--out", &model], 0);
     let flow = dataflow(folder.path(), &[("rate: 10", "rate: max"), (MODEL, &model)]);
     let flow = flow.to_str().expect("UTF-8");

@@ -39,7 +39,8 @@ fn build(made: &Path) -> PathBuf {
     for command in ["build", "test"] {
         let mut cargo = Command::new(env!("CARGO"));
         cargo.current_dir(made).args([command, "--offline"]).env("CARGO_TARGET_DIR", target);
-        let output = cargo.env("CARGO_PROFILE_DEV_DEBUG", "0").output().expect("started");
+        cargo.env("CARGO_PROFILE_DEV_DEBUG", "0").env("CARGO_INCREMENTAL", "0");
+        let output = cargo.output().expect("started");
         let (stdout, stderr) = (text(&output.stdout), text(&output.stderr));
         assert!(!stderr.contains("warning"), "{stderr}");
         assert!(output.status.success(), "cargo {command}\n{stdout}\n{stderr}");

@@ -6,6 +6,9 @@ use crate::common::mistakes::read;
 use crate::common::python::{python, utf8};
 use crate::common::{blindgrasp, json_of, report_data, run, text};
 
+/// To build all objects takes longer than to simulate some grasps.
+const FEW_OBJECTS: &str = "box,can,mug";
+
 /// Runs a command in a folder.
 fn run_in(folder: &Path, arguments: &[&str], exit_code: i32) -> (String, String) {
     let mut command = blindgrasp();
@@ -23,49 +26,20 @@ fn run_in(folder: &Path, arguments: &[&str], exit_code: i32) -> (String, String)
 fn hands_that_people_own_lift_in_simulation() {
     for (hand, n_lifts) in [
         ("inspire-rh56dftp", "6"),
-        ("robotiq-2f85-tsf85", "16"),
+        ("robotiq-2f85-tsf85", "8"),
         ("uskin", "6"),
         ("unitree-dex3-1", "8"),
         ("allegro", "6"),
     ] {
         let folder = tempfile::tempdir().expect("a folder");
         run(&["init", utf8(folder.path()), "--hand", hand], 0);
-        let simulate = ["simulate", "--hand", hand, "--label", "lift", "--protocol", "planned", "--objects", "train"];
+        let simulate =
+            ["simulate", "--hand", hand, "--label", "lift", "--protocol", "planned", "--objects", FEW_OBJECTS];
         let few = ["--stable-fraction", "natural", "--grasps", n_lifts, "--out", "lifts.mcap"];
         let (said, _) = run_in(folder.path(), &[&simulate[..], &few].concat(), 0);
         let n_grasps = format!("grasps            {n_lifts}, ");
         assert!(said.contains(&n_grasps) && !said.contains(" 0.0 % stable"), "{hand}: {said}");
     }
-}
-
-/// The hint of `new hand`, with fewer lifts, for a hand with two cells: of slippery objects it drops many.
-#[test]
-fn the_hint_of_a_new_hand_ends_in_a_graph_that_starts() {
-    let folder = tempfile::tempdir().expect("a folder");
-    std::fs::write(folder.path().join("gripper.urdf"), read("hands/parallel-gripper.urdf")).expect("written");
-    std::fs::write(folder.path().join("slippery.yaml"), "{friction: 0.4, planner: {n_approaches: 4}}")
-        .expect("written");
-    let grids = ["--open", "jaw=0.0425", "--grid", "left_jaw=1x1", "--grid", "right_jaw=1x1"];
-    let (said, _) = run_in(folder.path(), &other(&grids), 0);
-    let hint = said.lines().find_map(|line| line.trim().strip_prefix("blindgrasp learn ")).expect("a hint");
-    let hand = hint.split_whitespace().next().expect("a hand");
-    let few = ["learn", hand, "--options", "slippery.yaml", "--lifts", "250", "--max-drops", "0.5"];
-    let (said, _) = run_in(folder.path(), &few, 0);
-    let line = said.lines().find_map(|line| line.trim().strip_prefix("blindgrasp ")).expect("a command");
-    let start: Vec<&str> = line.split_whitespace().chain(["--check"]).collect();
-    let (_, warnings) = run_in(folder.path(), &start, 0);
-    assert!(start.contains(&"promised_drops=0.5") && warnings.is_empty(), "{line}\n{warnings}");
-    for file in ["other-gate/report.html", "other-gate/dataflow-live.yaml"] {
-        assert!(folder.path().join(file).is_file(), "{file}");
-    }
-    // A bound that so few lifts cannot keep: the model promises what it can, and the answer says what it would take.
-    let (said, stderr) = run_in(folder.path(), &[&few[..6], &["--max-drops", "0.02"]].concat(), 1);
-    assert!(stderr.contains("the bound of 2.0 % is not reached") && stderr.contains("--lifts 500"), "{stderr}");
-    assert!(said.contains("--set promised_drops=0."), "{said}");
-    // A bound that no number of kept objects shows.
-    let (_, stderr) = run_in(folder.path(), &[&few[..6], &["--max-drops", "0.001"]].concat(), 1);
-    let expected = "250 lifts of 250 objects, all kept, show that at most 1.19 % drop; expected 0.0120 or more";
-    assert!(stderr.contains(expected), "{stderr}");
 }
 
 #[test]
@@ -164,7 +138,8 @@ fn a_hand_is_made_from_xacro_with_meshes_and_grids() {
         assert!((number("normal", 1) + side).abs() < 1e-6, "{cell}");
     }
     let simulate = ["simulate", "--hand", "mine/mine.yaml", "--protocol", "planned", "--grasps", "10"];
-    run_in(folder.path(), &[&simulate[..], &["--stable-fraction", "natural", "--out", "grasps.mcap"]].concat(), 0);
+    let few = ["--objects", FEW_OBJECTS, "--stable-fraction", "natural", "--out", "grasps.mcap"];
+    run_in(folder.path(), &[&simulate[..], &few].concat(), 0);
 }
 
 /// The command that makes another hand of the gripper.

@@ -1,9 +1,13 @@
 use std::collections::HashMap;
+use std::sync::LazyLock;
 
 use nalgebra::Vector3;
 
 use super::*;
 use parry3d_f64::shape::TypedShape;
+
+/// Built once: that takes longer than most tests.
+static CATALOGUE: LazyLock<Vec<(Object, Mesh)>> = LazyLock::new(all);
 
 fn all() -> Vec<(Object, Mesh)> {
     let objects = select("all").expect("the catalogue builds");
@@ -80,7 +84,7 @@ fn the_catalogue_is_complete_and_a_third_is_held_out() {
 
 #[test]
 fn sizes_and_masses_are_of_everyday_things_and_all_differ() {
-    for class in all().chunks(N_PER_CLASS) {
+    for class in CATALOGUE.chunks(N_PER_CLASS) {
         let mut sizes_mm: Vec<[f64; 3]> = Vec::new();
         for (object, mesh) in class {
             let [least, most] = mesh.bounds();
@@ -100,7 +104,7 @@ fn sizes_and_masses_are_of_everyday_things_and_all_differ() {
 #[test]
 fn objects_stand_on_the_ground_or_have_their_centre_at_the_origin() {
     let mut odd = Vec::new();
-    for (object, mesh) in all() {
+    for (object, mesh) in CATALOGUE.iter() {
         let [least, most] = mesh.bounds();
         let centred = (least + most.coords).coords.norm() < 1e-9;
         let exact = !matches!(object.shape.as_typed_shape(), TypedShape::TriMesh(_));
@@ -114,7 +118,7 @@ fn objects_stand_on_the_ground_or_have_their_centre_at_the_origin() {
 #[test]
 fn surfaces_are_closed_and_face_outwards() {
     let mut large = Vec::new();
-    for (object, mesh) in all() {
+    for (object, mesh) in CATALOGUE.iter() {
         if matches!(object.shape.as_typed_shape(), TypedShape::TriMesh(_)) && mesh.triangles.len() > 6000 {
             large.push(format!("{object:?}: {} triangles", mesh.triangles.len()));
         }
@@ -127,7 +131,7 @@ fn surfaces_are_closed_and_face_outwards() {
             // No thinner than a micrometre.
             assert!(area_mm2 > 1e-3 * longest_mm / 2.0, "{object:?}: {area_mm2} mm² at {a}");
         }
-        for part in components(&mesh) {
+        for part in components(mesh) {
             assert!(part.signed_volume_m3() > 1e-10, "{object:?}: {} m³", part.signed_volume_m3());
         }
     }
@@ -139,7 +143,7 @@ fn surfaces_are_closed_and_face_outwards() {
 #[test]
 fn triangles_follow_curved_surfaces() {
     let mut odd = Vec::new();
-    for (object, mesh) in all() {
+    for (object, mesh) in CATALOGUE.iter() {
         let (mut worst_m, mut place) = (0.0, Point3::origin());
         let mut apex: HashMap<(u32, u32), usize> = HashMap::new();
         for (triangle_idx, &[a, b, c]) in mesh.triangles.iter().enumerate() {
@@ -182,22 +186,22 @@ fn triangles_follow_curved_surfaces() {
 
 #[test]
 fn vessels_are_hollow_and_what_is_joined_to_them_stays_out_of_the_hollow() {
-    for (object, mesh) in all() {
+    for (object, mesh) in CATALOGUE.iter() {
         let vessel = matches!(object.class.as_str(), "mug" | "cup" | "bowl" | "vase");
         let jug = object.class == "teapot" && object.name[7..].parse::<usize>().expect("a number") / 3 % 3 == 2;
         if !vessel && !jug {
             continue;
         }
-        let parts = components(&mesh);
+        let parts = components(mesh);
         // The wall is the one with a floor, under a plumb line.
         let plumb = |part: &&Mesh| !crossings(part, Point3::new(1e-4, 2e-4, 1.0), -Vector3::z()).is_empty();
         let wall =
             parts.iter().filter(plumb).max_by(|a, b| a.bounds()[1].z.total_cmp(&b.bounds()[1].z)).expect("a floor");
         let [least, most] = wall.bounds();
         let middle = Point3::new(1e-4, 2e-4, most.z - 0.35 * (most.z - least.z));
-        let above = crossings(&mesh, middle, Vector3::z());
+        let above = crossings(mesh, middle, Vector3::z());
         assert!(above.is_empty(), "{object:?} is closed above");
-        let winding: i32 = crossings(&mesh, middle, Vector3::new(0.9, 0.1, 0.05)).iter().map(|(_, sign)| sign).sum();
+        let winding: i32 = crossings(mesh, middle, Vector3::new(0.9, 0.1, 0.05)).iter().map(|(_, sign)| sign).sum();
         assert_eq!(winding, 0, "{object:?} is not hollow");
         let points: Vec<_> = mesh.vertices_m.iter().map(|corner| Vector::new(corner.x, corner.y, corner.z)).collect();
         let hull = SharedShape::convex_hull(&points).expect("a hull");
@@ -240,7 +244,7 @@ fn a_finger_goes_through_a_mugs_handle() {
 
 #[test]
 fn the_same_catalogue_twice() {
-    for (one, other) in all().iter().zip(all()) {
+    for (one, other) in CATALOGUE.iter().zip(all()) {
         assert_eq!(one.0.name, other.0.name);
         assert_eq!(one.1, other.1, "{}", one.0.name);
         assert_eq!(one.0.mass_kg.to_bits(), other.0.mass_kg.to_bits());

@@ -405,30 +405,30 @@ impl<T> Order<T> {
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
+    use crate::touches::training_objects;
     use blindgrasp_objects::select;
     use std::convert::Infallible;
     use std::path::Path;
 
     /// Grasps of the Barrett hand.
     pub(crate) fn simulated(
-        objects: &str,
+        objects: &[Object],
         options: &SimulatorOptions,
         n_threads: usize,
     ) -> (Vec<SimulatedGrasp>, SimulationReport) {
         let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
-        let objects = select(objects).expect("objects");
         let pool = rayon::ThreadPoolBuilder::new().num_threads(n_threads).build().expect("threads");
         let mut grasps = Vec::new();
         let keep = |grasp: SimulatedGrasp| {
             grasps.push(grasp);
             Ok::<_, Infallible>(())
         };
-        let report = pool.install(|| simulate_all(&hand, &objects, options, keep)).expect("simulated");
+        let report = pool.install(|| simulate_all(&hand, objects, options, keep)).expect("simulated");
         (grasps, report)
     }
 
     fn run(options: &SimulatorOptions, n_threads: usize) -> (Vec<SimulatedGrasp>, SimulationReport) {
-        simulated("train", options, n_threads)
+        simulated(training_objects().expect("a split"), options, n_threads)
     }
 
     pub(crate) fn check_same(grasps: &[SimulatedGrasp], others: &[SimulatedGrasp]) {
@@ -473,13 +473,13 @@ pub(crate) mod tests {
         let (all, _) = run(&options, 2);
         assert_eq!(all.iter().map(|grasp| grasp.truth.grasp_id).collect::<Vec<_>>(), (0..25).collect::<Vec<_>>());
         let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
-        let objects = select("train").expect("a split");
+        let objects = training_objects().expect("a split");
         let mut alone = Vec::new();
         let keep = |grasp: SimulatedGrasp| {
             alone.push(grasp);
             Ok::<_, Infallible>(())
         };
-        let simulation = Simulation { hand: &hand, objects: &objects, options: &options };
+        let simulation = Simulation { hand: &hand, objects, options: &options };
         simulation.part(&parts[1], || false, |_| {}, keep).expect("simulated");
         check_same(&alone, &all[10..20]);
     }

@@ -63,7 +63,7 @@ pub fn closings(hand: &Hand, candidates: Range<u64>, n_approaches: usize) -> Res
 }
 
 /// The training objects, which are made once: their hulls take longer than closings of a gripper.
-fn training_objects() -> Result<&'static [Object], SelectionError> {
+pub(crate) fn training_objects() -> Result<&'static [Object], SelectionError> {
     static MADE: OnceLock<Vec<Object>> = OnceLock::new();
     if MADE.get().is_none() {
         let _ = MADE.set(select("train")?);

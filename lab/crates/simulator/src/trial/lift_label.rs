@@ -227,8 +227,9 @@ mod tests {
 
     #[test]
     fn lifted_grasps_are_the_same_with_any_number_of_threads_and_have_a_simulated_ones_shape() {
-        let (one, report) = simulated("ball-01,box-03", &lifts(2), 1);
-        let (two, report_of_two) = simulated("ball-01,box-03", &lifts(2), 2);
+        let objects = select("ball-01,box-03").expect("objects");
+        let (one, report) = simulated(&objects, &lifts(2), 1);
+        let (two, report_of_two) = simulated(&objects, &lifts(2), 2);
         assert_eq!(report, report_of_two);
         check_same(&one, &two);
         assert_eq!((report.label, report.n_grasps), (Label::Lift, 2));
@@ -254,10 +255,11 @@ mod tests {
 
     #[test]
     fn another_time_step_of_the_lift_leaves_all_before_it_as_it_was() {
+        let objects = select("ball-01,box-03").expect("objects");
         let with = |step_secs: f64, lift_step_secs: Option<f64>| {
             let mut options = lifts(1);
             (options.lift.step_secs, options.lift.lift_step_secs) = (step_secs, lift_step_secs);
-            let mut grasp = simulated("ball-01,box-03", &options, 1).0.remove(0);
+            let mut grasp = simulated(&objects, &options, 1).0.remove(0);
             let n_before = grasp.frames.iter().position(|timed| timed.frame.phase == Phase::Lifting).expect("it lifts");
             grasp.frames.truncate(n_before);
             grasp
