@@ -150,17 +150,20 @@ impl Stage for Classify {
 }
 
 impl Classify {
-    /// Says once a grasp what speaks most against it, if the model finds the settled hand unstable.
+    /// Says once a grasp what speaks most against it, if the model does not find the settled hand stable.
     fn explain(&mut self, prediction: &PredictionHead, values: &[f64], now_nanos: u64) {
         let PredictionHead { grasp_id, phase, stable, unsure, fault, .. } = *prediction;
-        let is_unstable = phase == Phase::Settled.code() && fault == Fault::None.code() && stable == 0 && unsure == 0;
+        // A grasp of which the model is unsure may be probed.
+        let is_against = stable == 0 && (unsure == 0 || !self.model.has_probes());
+        let is_told = is_against && phase == Phase::Settled.code() && fault == Fault::None.code();
         let (told, at) = self.told.unwrap_or((u64::MAX, 0));
-        if !is_unstable || told == grasp_id || now_nanos.saturating_sub(at) < LOG_PAUSE_NANOS {
+        if !is_told || told == grasp_id || now_nanos.saturating_sub(at) < LOG_PAUSE_NANOS {
             return;
         }
         self.told = Some((grasp_id, now_nanos));
         if let Some(against) = self.model.speak_against(&self.value_names, values) {
-            print_diagnostic(&format!("grasp {grasp_id} seems unstable: {against}"));
+            let seems = if unsure == 0 { "seems unstable" } else { "may be unstable" };
+            print_diagnostic(&format!("grasp {grasp_id} {seems}: {against}"));
         }
     }
 

@@ -9,12 +9,12 @@ use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::operator::{Operator, parse_params};
 use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::stage::{self, Answers, Stage, decode_state, encode_state};
-use blindgrasp_stages::contacts::{ContactFinder, ContactSummary};
+use blindgrasp_stages::contacts::ContactSummary;
 use blindgrasp_stages::day::GraspPlace;
 use blindgrasp_stages::glitches::GlitchFilter;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::sensors::{Described, SensorCheck, SensorFault, SensorMemory};
-use blindgrasp_stages::steps::{contact_set, explain_fault, find_contacts};
+use blindgrasp_stages::steps::{ContactMemory, contact_set, explain_fault, find_contacts};
 use serde::Deserialize;
 
 use crate::beginning::FileNode;
@@ -50,9 +50,8 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
         watch = Some(Watch { operator: operator.clone(), check, memory, reported });
     }
     let max_contacts = hand.n_cells();
-    let flickering = Flickering { operator: operator.clone(), grasp: None, n_grasps: 0, has_counted: true };
-    let (finder, filter) = Default::default();
-    let stage = FindContacts { hand, finder, filter, watch, faults: FaultLog::default(), flickering };
+    let (memory, faults, odd) = Default::default();
+    let stage = FindContacts { hand, memory, watch, faults, odd };
     stage::run(operator, "tactile", "contacts", max_contacts, identity, stage)
 }
 
@@ -77,47 +76,23 @@ pub(crate) fn hand_of(path: &Path) -> anyhow::Result<(Hand, BTreeMap<String, Str
 
 struct FindContacts {
     hand: Hand,
-    finder: ContactFinder,
-    filter: GlitchFilter,
+    memory: ContactMemory,
     /// The watch over the sensors, which remembers their readings.
     watch: Option<Watch>,
-    faults: FaultLog,
-    flickering: Flickering,
+    faults: GraspLog,
+    odd: GraspLog,
 }
 
-/// Explains faulty frames without filling the log: one of a grasp, whose frames mostly have one fault, and one in a second. The
-/// next line says how many grasps had none.
+/// Says of grasps what is wrong with their frames without filling the log: each sentence once, and those of one grasp in a second.
+/// The next line says how many others had some.
 #[derive(Default)]
-struct FaultLog {
-    /// The last grasp with a faulty frame.
-    told: Option<u64>,
+struct GraspLog {
+    /// The last grasp with something wrong, whether it is one that is told, and the number of its sentences that have been.
+    grasp: Option<u64>,
+    is_told: bool,
+    n_told: usize,
     due_nanos: u64,
     n_more: u64,
-}
-
-/// The grasps in which cells were found to flicker, since the program started.
-struct Flickering {
-    operator: Operator,
-    grasp: Option<u64>,
-    n_grasps: u64,
-    /// The launcher knows the count.
-    has_counted: bool,
-}
-
-impl Flickering {
-    /// Counts a grasp once, and says of the first one that its cells flicker.
-    fn note(&mut self, grasp_id: u64, filter: &GlitchFilter, hand: &Hand) {
-        if self.grasp == Some(grasp_id) {
-            return;
-        }
-        let Some(found) = filter.flicker(hand) else { return };
-        self.grasp = Some(grasp_id);
-        if self.n_grasps == 0 {
-            tracing::warn!("grasp {grasp_id}: {found}");
-        }
-        self.n_grasps += 1;
-        self.has_counted = false;
-    }
 }
 
 /// The state that is saved: of the filter and of the watch, as far as there are any.
@@ -142,19 +117,30 @@ struct Reported {
     has_counted: bool,
 }
 
-impl FaultLog {
-    fn line(&mut self, grasp_id: u64, why: &str, now_nanos: u64) -> Option<String> {
-        self.told = Some(grasp_id);
-        if now_nanos < self.due_nanos {
-            self.n_more += 1;
-            return None;
+impl GraspLog {
+    /// The lines to be printed of a grasp of which this has been found so far.
+    fn lines(&mut self, grasp_id: u64, found: &[String], now_nanos: u64) -> Vec<String> {
+        if self.grasp != Some(grasp_id) && !found.is_empty() {
+            (self.grasp, self.n_told) = (Some(grasp_id), 0);
+            self.is_told = now_nanos >= self.due_nanos;
+            if self.is_told {
+                self.due_nanos = now_nanos + LOG_PAUSE_NANOS;
+            } else {
+                self.n_more += 1;
+            }
         }
-        self.due_nanos = now_nanos + LOG_PAUSE_NANOS;
-        let mut line = format!("a frame of grasp {grasp_id} cannot be judged: {why}");
-        if self.n_more > 0 {
-            line += &format!("; nor could one of each of {} grasps before it", std::mem::take(&mut self.n_more));
+        let mut lines = Vec::new();
+        if self.is_told && self.grasp == Some(grasp_id) {
+            for sentence in found.iter().skip(self.n_told) {
+                let before = match std::mem::take(&mut self.n_more) {
+                    0 => String::new(),
+                    n_more => format!("; of {n_more} grasps before it nothing was said"),
+                };
+                lines.push(format!("grasp {grasp_id}: {sentence}{before}"));
+            }
+            self.n_told = self.n_told.max(found.len());
         }
-        Some(line)
+        lines
     }
 }
 
@@ -205,20 +191,20 @@ impl Stage for FindContacts {
     }
 
     fn answer(&mut self, head: &TactileFrameHead, items: &[f64], now_nanos: u64, answers: &mut Answers<ContactSet>) {
-        let memory = (&mut self.finder, &mut self.filter);
-        let (mut summary, parts) = find_contacts(&self.hand, memory, head, items, answers.items());
+        let (mut summary, parts) = find_contacts(&self.hand, &mut self.memory, head, items, answers.items());
         // A hand that closes may have no contact yet.
         let is_at_rest = Phase::from_code(head.phase).is_ok_and(Phase::decides);
         if is_at_rest {
-            self.flickering.note(head.grasp_id, &self.filter, &self.hand);
+            let found = self.memory.odd_readings(&self.hand, head.grasp_id);
+            self.odd.lines(head.grasp_id, &found, now_nanos).iter().for_each(|line| print_diagnostic(line));
         }
-        if self.faults.told != Some(head.grasp_id)
+        if self.faults.grasp != Some(head.grasp_id)
             && Phase::from_code(head.phase).is_ok_and(|phase| !phase.is_over())
             && (is_at_rest || summary.fault != Fault::NoContact)
-            && let Some(why) = explain_fault(&self.hand, &self.finder, &summary, parts.as_ref())
-            && let Some(line) = self.faults.line(head.grasp_id, &why, now_nanos)
+            && let Some(why) = explain_fault(&self.hand, &self.memory.finder, &summary, parts.as_ref())
         {
-            print_diagnostic(&line);
+            let found = [format!("a frame cannot be judged: {why}")];
+            self.faults.lines(head.grasp_id, &found, now_nanos).iter().for_each(|line| print_diagnostic(line));
         }
         let phase = Phase::from_code(head.phase).ok().filter(|phase| !phase.is_over());
         if let (Some(watch), Some(parts), Some(phase)) = (&mut self.watch, &parts, phase)
@@ -232,10 +218,6 @@ impl Stage for FindContacts {
     }
 
     fn look(&mut self) {
-        let Flickering { operator, n_grasps, has_counted, .. } = &mut self.flickering;
-        if !std::mem::replace(has_counted, true) {
-            operator.has_counted(BTreeMap::from([("flickering_grasps".into(), *n_grasps)]));
-        }
         if let Some(watch) = &mut self.watch
             && std::mem::take(&mut watch.reported.has_counted)
         {
@@ -247,7 +229,7 @@ impl Stage for FindContacts {
         if !self.has_state() {
             return Ok(());
         }
-        let filter = self.hand.median_filter.then_some(&self.filter);
+        let filter = self.hand.median_filter.then_some(&self.memory.filter);
         let watch =
             self.watch.as_ref().map(|Watch { memory, reported, .. }| (memory, reported.grasp, &reported.counts));
         encode_state("contacts", (filter, watch), bytes)
@@ -258,7 +240,7 @@ impl Stage for FindContacts {
             Some(bytes) if self.has_state() => decode_state("contacts", bytes)?,
             _ => Default::default(),
         };
-        self.filter = saved.0.unwrap_or_default();
+        self.memory.filter = saved.0.unwrap_or_default();
         if let Some(watch) = &mut self.watch {
             (watch.memory, watch.reported.grasp, watch.reported.counts) = saved.1.unwrap_or_default();
         }
@@ -271,11 +253,16 @@ mod tests {
     use super::*;
 
     #[test]
-    fn faults_of_many_grasps_are_a_line_in_a_second() {
-        let mut faults = FaultLog::default();
-        assert_eq!(faults.line(7, "why", 5).as_deref(), Some("a frame of grasp 7 cannot be judged: why"));
-        assert_eq!((8..10).find_map(|grasp_id| faults.line(grasp_id, "why", LOG_PAUSE_NANOS)), None);
-        let line = faults.line(10, "why", LOG_PAUSE_NANOS + 5).expect("due");
-        assert_eq!(line, "a frame of grasp 10 cannot be judged: why; nor could one of each of 2 grasps before it");
+    fn each_sentence_is_a_line_and_grasps_within_a_second_are_counted() {
+        let mut log = GraspLog::default();
+        let said = |sentences: &[&str]| sentences.iter().map(|text| (*text).to_owned()).collect::<Vec<_>>();
+        assert_eq!(log.lines(7, &[], 5), [""; 0]);
+        assert_eq!(log.lines(7, &said(&["late"]), 5), ["grasp 7: late"]);
+        assert_eq!(log.lines(7, &said(&["late", "dead"]), 6), ["grasp 7: dead"]);
+        for grasp_id in [8, 8, 9, 7] {
+            assert_eq!(log.lines(grasp_id, &said(&["late"]), LOG_PAUSE_NANOS), [""; 0]);
+        }
+        let line = "grasp 10: late; of 3 grasps before it nothing was said";
+        assert_eq!(log.lines(10, &said(&["late"]), LOG_PAUSE_NANOS + 5), [line]);
     }
 }

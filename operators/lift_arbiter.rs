@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use blindgrasp_messages::{
-    Header, LiftDecision, LiftDecisionHead, Message, Prediction, PredictionHead, Reason, Recorded,
+    Action, Header, LiftDecision, LiftDecisionHead, Message, Prediction, PredictionHead, Recorded,
 };
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::operator::{Operator, parse_params};
@@ -318,7 +318,7 @@ impl Arbiter {
     fn publish(&mut self, answers: &mut Answers<LiftDecision>) {
         for decision in self.decided.drain(..) {
             let why = self.arbiter.explain(decision.grasp_id).join("; ");
-            if matches!(decision.reason, Reason::Stale | Reason::NoAgreement) && !why.is_empty() {
+            if decision.action == Action::Hold && !why.is_empty() {
                 tracing::warn!("grasp {} is held, {}: {why}", decision.grasp_id, decision.reason.as_str());
             }
             // By a recording's clock nothing expires.

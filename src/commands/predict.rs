@@ -122,7 +122,6 @@ fn print(json: bool, file: &Path, decided: &Decided, truth: Option<&GraspTruth>)
                 "reason": reason.as_str(),
                 "probability_stable": probability_stable,
                 "truth": truth,
-                "violations": decided.violations,
                 "why": decided.why,
             })
             .to_string(),

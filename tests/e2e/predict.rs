@@ -42,6 +42,15 @@ fn predictions_are_the_decisions_of_a_graph() {
     let unfelt = predicted.iter().filter(|line| line["reason"] == "no_contact");
     let self_contacts = "cells feel, but only on links that touch each other: ";
     assert_eq!((unfelt.count(), said.matches(self_contacts).count()), (37, 14), "{said}");
+    // Odd readings are told of a pad that is dead, of lifted grasps too, and of no healthy hand.
+    let odd = ["repeat their readings", "in phase settled", "in the open hand", "grasps before"];
+    assert!(!odd.iter().any(|words| said.contains(words)), "{said}");
+    let of_dead_pad = text(&run(&["predict", MODEL, "recordings/dead-pad.mcap"], 0).stdout).to_string();
+    assert_eq!(
+        of_dead_pad.matches("24 of 24 cells of pad finger_2 repeat their readings").count(),
+        12,
+        "{of_dead_pad}"
+    );
     let unfelt = predicted.iter().find(|line| line["reason"] == "no_contact").expect("an empty hand");
     assert_eq!(unfelt["probability_stable"], 0.0);
 }

@@ -7,7 +7,6 @@ use crate::dataset::{DatasetError, Grasp, read_grasps};
 use blindgrasp_messages::score::is_judged;
 use blindgrasp_messages::{GraspTruth, Header, LiftDecision, Phase, Prediction, Reason, Stamped, TactileFrame};
 use blindgrasp_stages::Judge;
-use blindgrasp_stages::out_of_distribution::Violation;
 use blindgrasp_stages::training_summary::ReadingId;
 
 /// A grasp of a recording, decided.
@@ -17,9 +16,7 @@ pub struct Decided {
     /// Of its first settled frame.
     pub reading_id: Option<ReadingId>,
     pub truth: Option<GraspTruth>,
-    /// The limits that it violates, if it was held as out of distribution.
-    pub violations: Vec<Violation>,
-    /// Why it was held, sentence by sentence.
+    /// Why it was held, and the odd readings of its frames, sentence by sentence.
     pub why: Vec<String>,
 }
 
@@ -35,15 +32,24 @@ pub fn decide(judge: &mut Judge, recording: &Path) -> Result<Vec<Decided>, Datas
 /// As [`decide`], for frames that are numbered without gaps (`seq`).
 pub fn decide_frames(judge: &mut Judge, frames: &[Stamped<TactileFrame>]) -> Vec<Decided> {
     judge.reset();
-    let mut decided: Vec<Decided> = frames.iter().flat_map(|frame| sample(judge, frame)).collect();
+    let (mut decided, mut odd) = (Vec::new(), BTreeMap::new());
+    for frame in frames {
+        decided.extend(sample(judge, frame, &mut odd));
+    }
     decided.extend(end(judge));
     decided.retain(|decided| decided.decision.action.decides());
+    for Decided { decision, why, .. } in &mut decided {
+        why.extend(odd.remove(&decision.grasp_id).unwrap_or_default());
+    }
     decided
 }
 
-/// The decisions that come with a frame.
-fn sample(judge: &mut Judge, frame: &Stamped<TactileFrame>) -> Vec<Decided> {
+/// The decisions that come with a frame. It notes the odd readings of its grasp until now, which go on after the decision.
+fn sample(judge: &mut Judge, frame: &Stamped<TactileFrame>, odd: &mut BTreeMap<u64, Vec<String>>) -> Vec<Decided> {
     let decisions = judge.sample(frame).decisions;
+    if frame.message.phase.decides() {
+        odd.insert(frame.message.grasp_id, judge.odd_readings());
+    }
     decisions.into_iter().map(|decision| explained(judge, decision)).collect()
 }
 
@@ -54,13 +60,12 @@ fn end(judge: &mut Judge) -> Option<Decided> {
 }
 
 fn explained(judge: &Judge, decision: LiftDecision) -> Decided {
-    let (violations, why) = (judge.violations(&decision).to_vec(), judge.explain(&decision));
-    Decided { violations, why, ..Decided::from(decision) }
+    Decided { why: judge.explain(&decision), ..Decided::from(decision) }
 }
 
 impl From<LiftDecision> for Decided {
     fn from(decision: LiftDecision) -> Self {
-        Decided { decision, reading_id: None, truth: None, violations: Vec::new(), why: Vec::new() }
+        Decided { decision, reading_id: None, truth: None, why: Vec::new() }
     }
 }
 
@@ -75,11 +80,11 @@ pub fn has_probability(reason: Reason) -> bool {
 /// The recording cannot be used.
 pub fn decide_recording(judge: &mut Judge, path: &Path) -> Result<Vec<Decided>, DatasetError> {
     judge.begin_recording();
-    let mut decisions = Vec::new();
+    let (mut decisions, mut odd) = (Vec::new(), BTreeMap::new());
     let hand = judge.hand().clone();
     let grasps = read_grasps(path, &hand, |_, frames| {
         for frame in &frames {
-            decisions.extend(sample(judge, frame));
+            decisions.extend(sample(judge, frame, &mut odd));
         }
         let settled = frames.iter().map(|frame| &frame.message).find(|frame| frame.phase == Phase::Settled);
         settled.map(|frame| ReadingId::of(&frame.joints, &frame.cells_newtons))
@@ -93,10 +98,11 @@ pub fn decide_recording(judge: &mut Judge, path: &Path) -> Result<Vec<Decided>, 
     let mut by_grasp: BTreeMap<u64, Decided> = deciding.map(|decided| (decided.decision.grasp_id, decided)).collect();
     let mut all = Vec::with_capacity(grasps.len());
     for Grasp { grasp_id, value, truth } in grasps {
-        let decided = match by_grasp.remove(&grasp_id) {
+        let mut decided = match by_grasp.remove(&grasp_id) {
             Some(decided) => decided,
             None => LiftDecision { grasp_id, ..LiftDecision::default() }.into(),
         };
+        decided.why.extend(odd.remove(&grasp_id).unwrap_or_default());
         all.push(Decided { reading_id: value, truth, ..decided });
     }
     Ok(all)

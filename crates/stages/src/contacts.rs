@@ -91,8 +91,8 @@ pub fn invalid_reading(hand: &Hand, joints: &[f64], cells_newtons: &[f64]) -> Op
             1 => found += "; another joint is outside its range, too",
             n_others => found += &format!("; {n_others} other joints are outside their range, too"),
         }
-        if outside().count() > 1 && !is_far {
-            found += ": are the joints in the order of the hand's layout?";
+        if value.is_finite() && !is_far {
+            found += ": are sign, zero and order of the joints those of the hand's layout?";
         }
         return Some(found);
     }
@@ -351,8 +351,9 @@ mod tests {
         joints[2] = f64::NAN;
         assert_eq!(found(&joints, &cells), Some(format!("{degrees}; another joint is outside its range, too")));
         // A wrong zero is no other unit.
+        let asked = ": are sign, zero and order of the joints those of the hand's layout?";
         let near = found(&[0.0, 2.6, 0.0, 0.0, 0.0, 0.0, 0.0], &cells);
-        assert_eq!(near.as_deref(), Some("joint finger_1 reads 2.6, expected 0 to 2.443 rad"));
+        assert_eq!(near.as_deref(), Some(&format!("joint finger_1 reads 2.6, expected 0 to 2.443 rad{asked}")[..]));
         // The first of them could be in degrees, the others not.
         joints = [2048.0; 7];
         joints[0] = 170.0;

@@ -113,10 +113,11 @@ impl GlitchFilter {
         }
     }
 
-    /// That cells flicker in the grasp of the last frame, if they do: for people.
-    pub fn flicker(&self, hand: &Hand) -> Option<String> {
+    /// That cells flicker in the grasp of the last frame, if they do, and it has this number: for people.
+    pub fn flicker(&self, hand: &Hand, grasp_id: u64) -> Option<String> {
         let Spikes { n_frames, n_spikes, highest } = &self.spikes;
-        if *n_spikes < MIN_SPIKES || n_spikes * FRAMES_A_SPIKE < *n_frames {
+        let is_of_grasp = self.place.is_some_and(|(_, of_grasp, _)| of_grasp == grasp_id);
+        if !is_of_grasp || *n_spikes < MIN_SPIKES || n_spikes * FRAMES_A_SPIKE < *n_frames {
             return None;
         }
         let cell_idx = highest.as_ref()?.0 as usize;
@@ -186,13 +187,13 @@ mod tests {
             let cells = frame(&hand, if idx % 3 == 0 { 0.4 } else { 0.0 });
             assert_eq!(filter.steady(&hand, (1, 2), Phase::Closing, &cells), cells);
         }
-        let said = filter.flicker(&hand).expect("it flickers");
+        let said = filter.flicker(&hand, 2).expect("it flickers");
         assert!(said.contains("cell 7 of pad palm") && said.contains("median_filter"), "{said}");
         // A load that comes and stays is none.
         for idx in 0..60 {
             filter.steady(&hand, (1, 3), Phase::Closing, &frame(&hand, f64::from(idx / 10)));
         }
-        assert_eq!(filter.flicker(&hand), None);
+        assert_eq!(filter.flicker(&hand, 3), None);
     }
 
     #[test]

@@ -2,14 +2,12 @@
 
 use blindgrasp_messages::{Contact, Fault, Header, LiftDecision, Message, Prediction, Reason, Stamped, TactileFrame};
 
-use crate::contacts::ContactFinder;
-use crate::glitches::GlitchFilter;
 use crate::hand::Hand;
 use crate::lift_arbiter::{ArbiterOptions, LiftArbiter, Probe};
 use crate::model::{Memory, Model, OtherHand};
 use crate::out_of_distribution::Violation;
 use crate::own_lifts::{Adapt, OwnLifts};
-use crate::steps;
+use crate::steps::{self, ContactMemory};
 
 /// Judges the frames of a hand one after the other, and decides each grasp once.
 ///
@@ -20,8 +18,7 @@ pub struct Judge {
     hand_id: u64,
     model: Model,
     dictionary_id: u64,
-    finder: ContactFinder,
-    filter: GlitchFilter,
+    felt: ContactMemory,
     memory: Memory,
     arbiter: LiftArbiter,
     /// The number of the next frame of [`Judge::frame`].
@@ -43,8 +40,6 @@ struct Findings {
     invalid: Option<String>,
     /// Why its last frame at rest has no contact.
     no_contact: Option<String>,
-    /// That its cells flicker.
-    flicker: Option<String>,
 }
 
 /// The judgement of a frame.
@@ -78,8 +73,7 @@ impl Judge {
             dictionary_id,
             hand,
             model,
-            finder: ContactFinder::default(),
-            filter: GlitchFilter::default(),
+            felt: ContactMemory::default(),
             memory: Memory::default(),
             arbiter: LiftArbiter::new(options),
             next_seq: 0,
@@ -126,8 +120,7 @@ impl Judge {
     fn judge(&mut self, header: Header, frame: &TactileFrame) -> Judged {
         self.next_seq = header.seq.wrapping_add(1);
         let (head, items) = frame.to_parts(header);
-        let memory = (&mut self.finder, &mut self.filter);
-        let (summary, parts) = steps::find_contacts(&self.hand, memory, &head, &items, &mut self.contacts);
+        let (summary, parts) = steps::find_contacts(&self.hand, &mut self.felt, &head, &items, &mut self.contacts);
         let contacts = steps::contact_set(&self.hand, &head, summary, parts.as_ref());
         let feature = steps::encode(&self.model, self.dictionary_id, &contacts, &self.contacts, &mut self.values);
         if self.found.grasp_id != frame.grasp_id {
@@ -135,16 +128,13 @@ impl Judge {
             self.found_before = std::mem::replace(&mut self.found, found);
         }
         if summary.fault != Fault::NoContact || frame.phase.decides() {
-            let why = steps::explain_fault(&self.hand, &self.finder, &summary, parts.as_ref());
+            let why = steps::explain_fault(&self.hand, &self.felt.finder, &summary, parts.as_ref());
             let found = &mut self.found;
             if summary.fault == Fault::NoContact {
                 found.no_contact = why;
             } else if found.invalid.is_none() {
                 found.invalid = why;
             }
-        }
-        if frame.phase.decides() && self.found.flicker.is_none() {
-            self.found.flicker = self.filter.flicker(&self.hand);
         }
         if feature.fault == Fault::OutOfDistribution.code() && frame.phase.decides() {
             self.found.violations = steps::violations(&self.model, &contacts, &self.contacts);
@@ -158,35 +148,19 @@ impl Judge {
         Judged { prediction, decisions }
     }
 
-    /// The limits that a grasp violates which has just been held as out of distribution; none for another decision.
-    pub fn violations(&self, decision: &LiftDecision) -> &[Violation] {
-        let is_of_it = decision.reason == Reason::OutOfDistribution && decision.grasp_id == self.found.grasp_id;
-        if is_of_it { &self.found.violations } else { &[] }
-    }
-
     /// Why a grasp was held that has just been decided, sentence by sentence: by names of joints, pads and links, with
     /// what was found and what was expected. Empty if its reason says all that is known.
     pub fn explain(&self, decision: &LiftDecision) -> Vec<String> {
         let is_of_last_frame = decision.grasp_id == self.found.grasp_id;
         // A grasp may be held when the next one begins.
         let found = if is_of_last_frame { &self.found } else { &self.found_before };
-        let mut why = self.explain_reason(decision, found, is_of_last_frame);
-        if matches!(
-            decision.reason,
-            Reason::Unstable | Reason::NoAgreement | Reason::OutOfDistribution | Reason::NoContact
-        ) && decision.grasp_id == found.grasp_id
-        {
-            why.extend(found.flicker.clone());
-        }
-        why
-    }
-
-    fn explain_reason(&self, decision: &LiftDecision, found: &Findings, is_of_last_frame: bool) -> Vec<String> {
         match decision.reason {
-            Reason::Stale | Reason::NoAgreement => self.arbiter.explain(decision.grasp_id),
+            Reason::Stale | Reason::NoAgreement | Reason::Missing | Reason::OutOfOrder => {
+                self.arbiter.explain(decision.grasp_id)
+            }
             _ if decision.grasp_id != found.grasp_id => Vec::new(),
             Reason::Invalid => found.invalid.iter().cloned().collect(),
-            Reason::Unstable if is_of_last_frame && self.arbiter.options().probe == Probe::None => {
+            Reason::Unstable | Reason::Unsure if is_of_last_frame && self.arbiter.options().probe == Probe::None => {
                 let names = self.model.features.value_names(&self.hand);
                 self.model.speak_against(&names, &self.values).into_iter().collect()
             }
@@ -194,6 +168,11 @@ impl Judge {
             Reason::OutOfDistribution => Violation::most(&found.violations),
             _ => Vec::new(),
         }
+    }
+
+    /// The readings of the last frame's grasp that a healthy hand does not give, a sentence each, whatever is decided.
+    pub fn odd_readings(&self) -> Vec<String> {
+        self.felt.odd_readings(&self.hand, self.found.grasp_id)
     }
 
     /// Holds the open grasp, if any, because no more frames come.
@@ -216,7 +195,7 @@ impl Judge {
 
     fn forget_grasps(&mut self) {
         self.arbiter = LiftArbiter::new(*self.arbiter.options());
-        self.filter = GlitchFilter::default();
+        self.felt = ContactMemory::default();
         self.next_seq = 0;
         (self.found, self.found_before) = Default::default();
     }
@@ -295,6 +274,7 @@ mod tests {
         let decision = LiftDecision { grasp_id: 1, reason: Reason::Unstable, ..LiftDecision::default() };
         let [why] = &judge.explain(&decision)[..] else { panic!("one sentence") };
         assert!(why.starts_with("of pads and joints, most against it: ") && why.matches(" is ").count() == 2, "{why}");
+        assert!(why.ends_with("; pad palm alone feels"), "{why}");
     }
 
     #[test]

@@ -31,6 +31,7 @@
 //! * [`contacts`], [`encoder`] (with [`dictionary`] and [`histogram`]), [`classifier`], [`lift_arbiter`] - the stages.
 //!   [`steps`] - the first three, from message to message.
 //! * [`out_of_distribution`] - whether a grasp is like those that the model was trained on.
+//! * [`odd_readings`] - faults of hands that can be told without training.
 //! * [`model`] - the model file. [`recipe`] and [`training_summary`] - how a model was trained, as the file says.
 //! * [`own_lifts`] - corrections of a model by the lifts of its robot. [`promise_monitor`] - whether lifts drop more often than was
 //!   promised, and the bound that they allow.
@@ -53,6 +54,7 @@ pub mod label;
 pub mod lift_arbiter;
 mod lift_watch;
 pub mod model;
+pub mod odd_readings;
 pub mod out_of_distribution;
 pub mod own_lifts;
 pub mod probe;

@@ -100,17 +100,10 @@ impl Default for ArbiterOptions {
 pub struct LiftArbiter {
     options: ArbiterOptions,
     state: ArbiterState,
-    /// The last grasp that was held as stale or without agreement.
-    held: Option<Held>,
-}
-
-/// What is known of a grasp that was held as stale or without agreement.
-#[derive(Debug, Clone, Copy)]
-struct Held {
-    grasp_id: u64,
-    stale: Option<Staleness>,
-    /// The phase of the probe that was asked for, if no frame of it has come.
-    unanswered: Option<Phase>,
+    /// How a prediction broke the order last: its number, that of the one before, and the nanoseconds between them.
+    broken: Option<(u64, u64, i128)>,
+    /// The last grasp that was held for want of good frames, and why, sentence by sentence.
+    held: Option<(u64, Vec<String>)>,
 }
 
 /// The limit that makes a grasp stale, and what was found.
@@ -384,7 +377,7 @@ impl ArbiterOptions {
 impl LiftArbiter {
     /// An arbiter that has seen nothing.
     pub fn new(options: ArbiterOptions) -> Self {
-        LiftArbiter { options, state: ArbiterState { options, ..ArbiterState::default() }, held: None }
+        LiftArbiter { options, state: ArbiterState { options, ..ArbiterState::default() }, broken: None, held: None }
     }
 
     pub fn state(&self) -> &ArbiterState {
@@ -512,19 +505,12 @@ impl LiftArbiter {
         self.hold(reason)
     }
 
-    /// Why a grasp was held that has just been held as stale or without agreement, sentence by sentence: the limit that it has
-    /// exceeded, and the probe that did not come.
+    /// Why a grasp was held that has just been held as stale, out of order, missing or without agreement, sentence by sentence.
     pub fn explain(&self, grasp_id: u64) -> Vec<String> {
-        let Some(held) = self.held.filter(|held| held.grasp_id == grasp_id) else { return Vec::new() };
-        let mut said: Vec<String> = held.stale.iter().map(Staleness::to_string).collect();
-        if let Some(phase) = held.unanswered {
-            said.push(format!(
-                "no frame of phase {} came after the probe was asked for: let the hand or arm make it and send its frames, or set \
-                 probe to none",
-                phase.as_str()
-            ));
+        match &self.held {
+            Some((held, why)) if *held == grasp_id => why.clone(),
+            _ => Vec::new(),
         }
-        said
     }
 
     /// How long no prediction may come while a grasp is open.
@@ -541,6 +527,10 @@ impl LiftArbiter {
     fn arrive(&mut self, header: &Header, prediction: &Prediction, age_nanos: u64) -> Arrival {
         let grasp_id = prediction.grasp_id;
         let break_in_order = self.break_in_order(header, grasp_id);
+        if let (Some(Reason::OutOfOrder), Some(last)) = (break_in_order, &self.state.last) {
+            let nanos = i128::from(header.stamp_nanos) - i128::from(last.stamp_nanos);
+            self.broken = Some((header.seq, last.seq, nanos));
+        }
         let state = &mut self.state;
         let is_open = state.open.as_ref().is_some_and(|open| open.grasp_id == grasp_id);
         let mut stale = self.options.staleness_of(header, age_nanos);
@@ -632,10 +622,11 @@ impl LiftArbiter {
     /// Remembers that the open grasp is decided, and begins to watch it if it is lifted.
     fn close(&mut self, decision: &LiftDecision) {
         let Some(open) = self.state.open.take() else { return };
-        let OpenGrasp { epoch, grasp_id, stale, .. } = open;
-        if matches!(decision.reason, Reason::Stale | Reason::NoAgreement) {
-            let unanswered = open.is_probe_pending.then_some(open.awaited);
-            self.held = Some(Held { grasp_id, stale, unanswered });
+        let OpenGrasp { epoch, grasp_id, .. } = open;
+        let why = self.grounds(&open, decision.reason);
+        // Another run of the source may use the number again.
+        if !why.is_empty() || self.held.as_ref().is_some_and(|(held, _)| *held == grasp_id) {
+            self.held = Some((grasp_id, why));
         }
         self.state.decided.push((epoch, grasp_id), self.options.n_remembered);
         if decision.action == Action::Lift {
@@ -645,6 +636,33 @@ impl LiftArbiter {
             let is_unreported = before.is_some() && !watch.is_some_and(|watch| watch.is_set_down());
             self.state.n_unreported += u64::from(is_unreported);
         }
+    }
+
+    /// The limit that a grasp has exceeded, or the frames that did not come, for people.
+    fn grounds(&self, open: &OpenGrasp, reason: Reason) -> Vec<String> {
+        let mut said = Vec::new();
+        if let (Reason::Stale | Reason::NoAgreement, Some(stale)) = (reason, open.stale) {
+            said.push(stale.to_string());
+        }
+        match reason {
+            Reason::Stale | Reason::NoAgreement if open.is_probe_pending => said.push(format!(
+                "no frame of phase {} came after the probe was asked for: let the hand or arm make it and send its frames, or set \
+                 probe to none",
+                open.awaited.as_str()
+            )),
+            Reason::NoAgreement if open.n_settled < self.options.votes => {
+                let (n_settled, votes) = (open.n_settled, self.options.votes);
+                said.push(format!("only {n_settled} of its frames could vote, and {votes} in a row must agree (votes)"));
+            }
+            Reason::Missing => said.push("no frame of phase settled came before its end".into()),
+            Reason::OutOfOrder => {
+                let Some((seq, last_seq, nanos)) = self.broken else { return said };
+                let (millis, order) = (nanos.abs() as f64 / 1e6, if nanos < 0 { "earlier" } else { "later" });
+                said.push(format!("frame {seq} came after frame {last_seq}, by its time {millis:.1} ms {order}"));
+            }
+            _ => {}
+        }
+        said
     }
 
     /// The problem of `header` after the last one. A gap between grasps counts against the new grasp, because its first frames
@@ -949,6 +967,24 @@ mod tests {
         // The probe came, and its frames do not agree.
         s.takes("N+++[2 TestLift Promising]sqqqlte[2 Hold NoAgreement]");
         assert_eq!(s.arbiter.explain(2), Vec::<String>::new());
+    }
+
+    #[test]
+    fn a_grasp_that_lacks_frames_or_their_order_says_so() {
+        let mut s = stream(ArbiterOptions::default());
+        for (grasp_id, history, said) in [
+            (0, "cce[0 Hold Missing]", "no frame of phase settled came before its end"),
+            (1, "N++e[1 Hold NoAgreement]", "only 2 of its frames could vote, and 3 in a row must agree (votes)"),
+            (2, "NcL+[2 Hold OutOfOrder]", "frame 8 came after frame 6, by its time 10.0 ms later"),
+            (3, "NcB+[3 Hold OutOfOrder]", "frame 10 came after frame 9, by its time 10.0 ms earlier"),
+            (4, "N+-+e[4 Hold NoAgreement]", ""),
+        ] {
+            s.takes(history);
+            assert_eq!(s.arbiter.explain(grasp_id).join("; "), said);
+        }
+        // Another run of the source has a grasp of the same number, which has another reason.
+        s.takes("N+e[5 Hold NoAgreement]E---[5 Hold Unstable]");
+        assert_eq!(s.arbiter.explain(5), Vec::<String>::new());
     }
 
     #[test]

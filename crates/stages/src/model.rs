@@ -325,8 +325,8 @@ impl Model {
         self.features.names_of_values(&parts)
     }
 
-    /// The two values of pads and joints in the feature of a settled frame that speak most against the grasp, for people. Only
-    /// trees can tell, and no model that judges by the day's earlier grasps. `names` are those of the values.
+    /// The two values of pads and joints in the feature of a settled frame that speak most against the grasp, and the pad that feels
+    /// alone, for people. Only trees can tell, and no model that judges by the day's earlier grasps. `names` are those of the values.
     pub fn speak_against(&self, names: &[String], values: &[f64]) -> Option<String> {
         let trees = match &self.classifier.predictor {
             Predictor::Boosting(trees) => trees,
@@ -348,7 +348,22 @@ impl Model {
         for (_, idx) in against.into_iter().take(2) {
             said.push(format!("{} is {}", names[idx], short(self.features.unscaled(idx, values[idx]))));
         }
-        if said.is_empty() { None } else { Some(format!("of pads and joints, most against it: {}", said.join(", "))) }
+        if said.is_empty() {
+            return None;
+        }
+        let mut against = format!("of pads and joints, most against it: {}", said.join(", "));
+        let mut pads_that_feel = Vec::new();
+        for (idx, name) in names.iter().enumerate() {
+            if let Some(pad) = name.strip_suffix(".load")
+                && self.features.unscaled(idx, values[idx]) > 0.0
+            {
+                pads_that_feel.push(pad);
+            }
+        }
+        if let [pad] = pads_that_feel[..] {
+            against += &format!("; pad {pad} alone feels");
+        }
+        Some(against)
     }
 
     /// Whether it judges anything but settled grasps.

@@ -14,12 +14,31 @@ use crate::encoder::FeltReading;
 use crate::glitches::GlitchFilter;
 use crate::hand::Hand;
 use crate::model::{Memory, Model};
+use crate::odd_readings::OddReadings;
 use crate::out_of_distribution::Violation;
+
+/// What the contacts step keeps of the frames before.
+#[derive(Debug, Default)]
+pub struct ContactMemory {
+    pub finder: ContactFinder,
+    /// It is saved with the state of a graph's contacts stage.
+    pub filter: GlitchFilter,
+    odd: OddReadings,
+}
+
+impl ContactMemory {
+    /// The readings of a grasp that a healthy hand does not give, a sentence each; none if the last frame is of another grasp.
+    pub fn odd_readings(&self, hand: &Hand, grasp_id: u64) -> Vec<String> {
+        let mut said = self.odd.said(hand, grasp_id);
+        said.extend(self.filter.flicker(hand, grasp_id));
+        said
+    }
+}
 
 /// Finds the contacts of a frame. It also returns the frame's parts, if they can be read.
 pub fn find_contacts<'a>(
     hand: &Hand,
-    (finder, filter): (&mut ContactFinder, &mut GlitchFilter),
+    memory: &mut ContactMemory,
     head: &TactileFrameHead,
     items: &'a [f64],
     contacts: &mut Vec<Contact>,
@@ -28,11 +47,16 @@ pub fn find_contacts<'a>(
         Ok(parts) => {
             let FrameParts { joints, cells_newtons, .. } = parts;
             let place = (head.header.epoch, head.grasp_id);
-            let steady = match Phase::from_code(head.phase) {
-                Ok(phase) => filter.steady(hand, place, phase, cells_newtons),
+            let phase = Phase::from_code(head.phase);
+            let steady = match phase {
+                Ok(phase) => memory.filter.steady(hand, place, phase, cells_newtons),
                 Err(_) => cells_newtons,
             };
-            (finder.find(hand, head.header.hand_id, joints, steady, contacts), Some(parts))
+            let summary = memory.finder.find(hand, head.header.hand_id, joints, steady, contacts);
+            if let (Ok(phase), Fault::None | Fault::NoContact) = (phase, summary.fault) {
+                memory.odd.note(hand, place, phase, (joints, cells_newtons), contacts);
+            }
+            (summary, Some(parts))
         }
         Err(_) => {
             contacts.clear();
@@ -182,8 +206,8 @@ mod tests {
         let joints = stops.iter().map(|stop| stop + 0.01).collect();
         let frame = TactileFrame { joints, cells_newtons: vec![1.0; hand.n_cells()], ..TactileFrame::default() };
         let (head, items) = frame.to_parts(Header::default());
-        let (mut finder, mut filter, mut contacts) = (ContactFinder::default(), GlitchFilter::default(), Vec::new());
-        let (summary, parts) = find_contacts(&hand, (&mut finder, &mut filter), &head, &items, &mut contacts);
+        let (mut memory, mut contacts) = (ContactMemory::default(), Vec::new());
+        let (summary, parts) = find_contacts(&hand, &mut memory, &head, &items, &mut contacts);
         let set = contact_set(&hand, &head, summary, parts.as_ref());
         stops[0] = 0.51;
         assert_eq!(set.joints(), Ok(&stops[..]));

@@ -422,7 +422,7 @@ impl Latest {
         decided.frame = frame.cloned();
         // After a probe, another model has judged.
         let is_settled = decided.frame.as_ref().is_none_or(|shown| shown.frame.phase == Phase::Settled);
-        if decided.decision.reason == Reason::Unstable
+        if matches!(decided.decision.reason, Reason::Unstable | Reason::Unsure)
             && is_settled
             && let (Some(hand), Some(feature)) = (hand, self.settled.get(&key))
         {
