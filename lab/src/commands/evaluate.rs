@@ -6,13 +6,14 @@ use anyhow::{Context, bail};
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 
+use super::model::{curve_lines, own_threshold};
 use super::{
     Outcome, check_output, check_page, number_in, percent, print_line, print_text, word, write_out, write_report,
 };
 use blindgrasp_grasps::dataset::{hand_of, label_line, labels_of};
 use blindgrasp_learning::evaluation::baselines::Baselines;
 use blindgrasp_learning::evaluation::cross_validation::{HeldOutOptions, judge_held_out};
-use blindgrasp_learning::evaluation::looks::{Look, looks};
+use blindgrasp_learning::evaluation::looks::Look;
 use blindgrasp_learning::evaluation::page::{FIGURE_1_FILE, figure_1, report_page};
 use blindgrasp_learning::evaluation::predictions::{OutsidePredictions, predictions_csv};
 use blindgrasp_learning::evaluation::report::{
@@ -43,7 +44,7 @@ const N_BASELINE_FOLDS: usize = 5;
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \
                         blindgrasp evaluate models/barrett-bh8-280.json recordings/held-out.mcap\n  \
-                        blindgrasp evaluate gate.json lifts --probe test_lift         the decisions after a test lift\n  \
+                        blindgrasp evaluate gate.json lifts --drop-costs 60           which threshold, if a drop costs as much as 60 attempts\n  \
                         blindgrasp evaluate data/paper --split object --folds 5 --report report.html\n  \
                         blindgrasp evaluate data/paper --split class --recipe boosted,paper,raw --json\n  \
                         blindgrasp evaluate data/paper --split object --predictions mine.csv  a model of your own beside them\n\n\
@@ -83,6 +84,10 @@ pub(super) struct Arguments {
     /// saves its charts as SVG.
     #[arg(long, value_name = "FOLDER")]
     figures: Option<PathBuf>,
+    /// Mark the threshold of the model with the least attempts for each kept object on these lifts, if a drop costs as much as so
+    /// many attempts.
+    #[arg(long, value_name = "ATTEMPTS", conflicts_with_all = ["split", "json"], value_parser = |text: &str| number_in(text, 0.0..=1e6))]
+    drop_costs: Option<f64>,
     /// Pad layout of the hand; default: the built-in hand that the first recording names.
     #[arg(long)]
     hand: Option<PathBuf>,
@@ -108,9 +113,9 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
              on these recordings, or --predictions of another model",
             arguments.inputs.first().map_or(Path::new(""), PathBuf::as_path).display()
         ),
-        (None, None) if arguments.probe != Probe::None => {
-            bail!("--probe: predictions are judged as they are: give a model as well, or leave out --probe")
-        }
+        (None, None) if arguments.probe != Probe::None || arguments.drop_costs.is_some() => bail!(
+            "--probe, --drop-costs: predictions are judged as they are: give a model as well, or leave these options out"
+        ),
         (Some(model), None) if recordings.is_empty() => {
             bail!("nothing to judge {} on: name recordings after it", model.display())
         }
@@ -182,18 +187,41 @@ impl Job<'_> {
         if let Some(trained_on) = &model.training.trained_on {
             read.examples.retain(|example| !trained_on.grasps.contains(&example.reading_id));
         }
-        let baselines = Baselines::new(model, &read.examples, &self.joints_alone(model, &read.examples));
-        if is_table {
-            print_looks(&looks(model, &read.examples))?;
-            print_baselines(baselines.as_ref())?;
-        }
+        let baselines = Baselines::new(model, &read, &self.joints_alone(model, &read.examples));
         let outside = self.outside(&read, &[file_name(path)])?;
         let name = file_name(path);
         let report = report_on_model(self.origin.clone(), &name, model, evaluated, &read, baselines, outside.as_ref());
-        if is_table && outside.is_some() {
-            print_judges(&report)?;
+        if is_table {
+            print_looks(&report.looks)?;
+            print_baselines(report.baselines.as_ref())?;
+            self.print_curve(model, report.baselines.as_ref())?;
+            if outside.is_some() {
+                print_judges(&report)?;
+            }
         }
         self.deliver(&report)
+    }
+
+    /// Prints what other thresholds of the model lead to on these lifts.
+    fn print_curve(&self, model: &Model, baselines: Option<&Baselines>) -> anyhow::Result<()> {
+        let drop_costs = self.arguments.drop_costs;
+        let Some(Baselines { look, curve, .. }) = baselines.filter(|baselines| !baselines.curve.is_empty()) else {
+            if drop_costs.is_some() {
+                bail!(
+                    "--drop-costs: these recordings lead to no curve of thresholds: expected lifts (simulate --label lift, or of a \
+                     robot), some kept and some dropped, of which the model lifts some"
+                );
+            }
+            return Ok(());
+        };
+        print_text(&curve_lines(look, curve, "kept", own_threshold(model, look), drop_costs).join("\n"))?;
+        let recordings: Vec<String> =
+            self.arguments.inputs[1..].iter().map(|path| path.display().to_string()).collect();
+        Ok(print_line(&format!(
+            "thresholds: for trials with the lifts of {} that some cell feels, each judged by one frame; lifts of objects that the \
+             model has learned from make them too good",
+            recordings.join(", ")
+        ))?)
     }
 
     /// The probabilities of lifts by a model of the joint angles alone, each by one that has not learned from its object. Empty

@@ -251,7 +251,7 @@ impl Job<'_> {
             hand: self.hand.name.clone(),
             recordings: recordings.iter().map(|path| file_name(path)).collect(),
         };
-        let baselines = Baselines::new(model, &read.examples, &[]);
+        let baselines = Baselines::new(model, &read, &[]);
         let report = report_on_model(origin, &file_name(&self.model_path()), model, evaluated, &read, baselines, None);
         write_report(&self.out.join(REPORT), &report_page(&self.hand, &report)?)?;
         Ok(score)

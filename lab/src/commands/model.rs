@@ -10,6 +10,7 @@ use super::train::{is_of_the_papers_label, probe_lines, threshold_line};
 use super::{Outcome, check_new, completions, number_in, percent, print_line, print_text};
 use blindgrasp_grasps::dataset::{hand_of, label_line};
 use blindgrasp_learning::training::adapt;
+use blindgrasp_messages::Phase;
 use blindgrasp_operator::text::counted;
 use blindgrasp_recording::recordings_in;
 use blindgrasp_stages::classifier::boosting::BoostedTrees;
@@ -19,7 +20,7 @@ use blindgrasp_stages::day::{Baseline, DayMethod};
 use blindgrasp_stages::model::Model;
 use blindgrasp_stages::own_lifts::Correction;
 use blindgrasp_stages::probe::ProbeModel;
-use blindgrasp_stages::training_summary::{OwnLiftsSummary, PolicySummary, Promise, RobotLifts, ThresholdPoint};
+use blindgrasp_stages::training_summary::{OwnLiftsSummary, Promise, RobotLifts, ThresholdPoint};
 
 /// Describe or adapt a model, or rate approaches
 #[derive(Debug, Args)]
@@ -203,34 +204,37 @@ pub(super) fn print_model(model: &Model, drop_costs: Option<f64>) -> std::io::Re
     }
     if let Some(policy) = model.training.policies.last() {
         let kept = if is_of_the_papers_label(&model.training) { "stable" } else { "kept" };
-        for line in curve_lines(policy, kept, own_threshold(model, policy), drop_costs) {
-            print_line(&line)?;
-        }
+        let own = own_threshold(model, &policy.look);
+        print_text(&curve_lines(&policy.look, &policy.curve, kept, own, drop_costs).join("\n"))?;
     }
     Ok(())
 }
 
-fn own_threshold(model: &Model, policy: &PolicySummary) -> f64 {
-    let probe = match policy.look.as_str() {
-        "squeezed" => &model.squeezed,
-        "test_lifted" => &model.test_lifted,
-        _ => &None,
-    };
-    probe.as_ref().map_or(&model.classifier, |probe| &probe.classifier).threshold_probability
+/// The threshold of a model at the look of this phase.
+pub(super) fn own_threshold(model: &Model, look: &str) -> f64 {
+    let phase = Phase::ALL.iter().find(|phase| phase.as_str() == look);
+    phase.and_then(|phase| model.look(*phase)).unwrap_or(&model.classifier).threshold_probability
 }
 
 /// The thresholds of the look that decides, for people, with the model's own and the cheapest for this price of a drop.
-fn curve_lines(policy: &PolicySummary, kept: &str, own: f64, drop_costs: Option<f64>) -> Vec<String> {
-    let look = policy.look.replace('_', "-");
-    if policy.curve.is_empty() {
+pub(super) fn curve_lines(
+    look: &str,
+    curve: &[ThresholdPoint],
+    kept: &str,
+    own: f64,
+    drop_costs: Option<f64>,
+) -> Vec<String> {
+    let look = look.replace('_', "-");
+    if curve.is_empty() {
         return vec![format!(
-            "no curve of thresholds when {look}: the model was adapted, or an earlier version trained it (blindgrasp train)"
+            "no curve of thresholds when {look}: the model was adapted, or an earlier version trained it (blindgrasp evaluate makes \
+             one from labelled lifts)"
         )];
     }
     let mut cheapest = None;
     if let Some(drop_costs) = drop_costs {
         let cost = |point: &&ThresholdPoint| point.attempts_per_kept(drop_costs);
-        cheapest = policy.curve.iter().min_by(|a, b| cost(a).total_cmp(&cost(b)));
+        cheapest = curve.iter().min_by(|a, b| cost(a).total_cmp(&cost(b)));
     }
     let mut lines = vec![format!(
         "{:<27} {:>8} {:>9} {:>16} {:>9} {:>20}",
@@ -241,7 +245,7 @@ fn curve_lines(policy: &PolicySummary, kept: &str, own: f64, drop_costs: Option<
         "given up",
         "drops at most (95 %)"
     )];
-    for point in &policy.curve {
+    for point in curve {
         let mut line = format!(
             "{:<27} {:>8} {:>9} {:>16.2} {:>9} {:>20}",
             format!("{:.4}", point.threshold_probability),
@@ -260,11 +264,8 @@ fn curve_lines(policy: &PolicySummary, kept: &str, own: f64, drop_costs: Option<
         lines.push(line);
     }
     if let Some(point) = cheapest {
-        // It is rounded down, so that it does not pass the grasps at the threshold; 0 is the model's own.
-        let mut threshold = ((1e4 * point.threshold_probability).floor() / 1e4).max(1e-4);
-        if point.threshold_probability == own {
-            threshold = 0.0;
-        }
+        // 0 is the model's own.
+        let threshold = if point.threshold_probability == own { 0.0 } else { point.threshold_probability };
         lines.push(format!("to choose it: blindgrasp set lift_arbiter.min_probability_stable={threshold}"));
     }
     lines
@@ -431,29 +432,19 @@ mod tests {
             given_up: 0.1,
             drops_at_most: Some(0.08),
         };
-        let mut policy = PolicySummary {
-            look: "test_lifted".into(),
-            drop_secs: 300.0,
-            roc_area: 0.97,
-            kept: 0.98,
-            attempts_per_lift: 6.0,
-            given_up: 0.1,
-            secs_per_kept: 30.0,
-            promise: None,
-            curve: vec![point(0.51239, 0.9, 2.0), point(0.933, 0.98, 6.0)],
-        };
-        let marked = |policy: &PolicySummary, drop_costs| curve_lines(policy, "kept", 0.933, drop_costs);
-        let lines = marked(&policy, None);
+        let curve = [point(0.5, 0.9, 2.0), point(0.933, 0.98, 6.0)];
+        let marked = |drop_costs| curve_lines("test_lifted", &curve, "kept", 0.933, drop_costs);
+        let lines = marked(None);
         assert_eq!((lines.len(), lines.iter().filter(|line| line.contains("cheapest")).count()), (3, 0));
         assert!(lines[2].contains("98.0 %") && lines[2].ends_with("8.0 %  the model's own"), "{lines:?}");
         // (2 + 10 x 0.1) / 0.9 = 3.3 attempts for each kept object, and (6 + 10 x 0.02) / 0.98 = 6.3.
-        let lines = marked(&policy, Some(10.0));
-        assert!(lines[1].contains("cheapest") && lines[3].ends_with("min_probability_stable=0.5123"), "{lines:?}");
+        let lines = marked(Some(10.0));
+        assert!(lines[1].contains("cheapest") && lines[3].ends_with("min_probability_stable=0.5"), "{lines:?}");
         // 13.3 and 8.2.
-        let lines = marked(&policy, Some(100.0));
+        let lines = marked(Some(100.0));
         assert!(lines[2].ends_with("the model's own  the cheapest for this price of a drop"), "{lines:?}");
         assert!(lines[3].ends_with("min_probability_stable=0"), "{lines:?}");
-        policy.curve.clear();
-        assert!(marked(&policy, Some(10.0))[0].starts_with("no curve of thresholds when test-lifted"));
+        let none = curve_lines("test_lifted", &[], "kept", 0.933, None);
+        assert!(none[0].starts_with("no curve of thresholds when test-lifted"), "{none:?}");
     }
 }

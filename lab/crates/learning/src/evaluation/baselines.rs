@@ -4,10 +4,12 @@ use serde::Serialize;
 
 use super::looks::judged_looks;
 use super::measures::{CurvePoint, area_under_roc, curve};
-use crate::training::{Example, reading_at};
+use crate::training::{Example, Examples, reading_at};
 use blindgrasp_messages::Phase;
 use blindgrasp_stages::encoder::wrist_values;
+use blindgrasp_stages::label::Label;
 use blindgrasp_stages::model::Model;
+use blindgrasp_stages::training_summary::ThresholdPoint;
 
 /// A model and plain rules at the look that decides.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -19,6 +21,9 @@ pub struct Baselines {
     pub false_positive_rate: f64,
     /// The model, and then the rules that the recordings have values for.
     pub rules: Vec<Rule>,
+    /// What other thresholds of the model lead to if these are lifts; empty if a label is the paper's.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub curve: Vec<ThresholdPoint>,
 }
 
 /// A value that is greater for stable grasps, and what a threshold on it is worth.
@@ -34,7 +39,8 @@ impl Baselines {
     /// Judges the examples that have the look; `None` if all of them are stable, or none, and for a model that looks at days, which
     /// judges no grasp alone. `joints` has for each example the probability by a model of the joint angles alone that has not
     /// learned from its object; it may be empty.
-    pub fn new(model: &Model, examples: &[Example], joints: &[f64]) -> Option<Baselines> {
+    pub fn new(model: &Model, read: &Examples, joints: &[f64]) -> Option<Baselines> {
+        let examples = &read.examples;
         if model.day.is_some() {
             return None;
         }
@@ -69,7 +75,9 @@ impl Baselines {
                 false_positive_rate,
             ));
         }
-        Some(Baselines { look: look.phase.as_str().into(), n_grasps: stable.len(), false_positive_rate, rules })
+        let is_of_lifts = !read.labels.contains_key(&Label::WrenchSpace);
+        let curve = if is_of_lifts { look.curve(examples) } else { Vec::new() };
+        Some(Baselines { look: look.phase.as_str().into(), n_grasps: stable.len(), false_positive_rate, rules, curve })
     }
 
     /// Says which rules are as good as the model.
@@ -135,7 +143,6 @@ mod tests {
     use std::path::{Path, PathBuf};
 
     use super::*;
-    use crate::training::Examples;
     use blindgrasp_grasps::reading::Felt;
     use blindgrasp_messages::{Contact, OwnedSenses};
     use blindgrasp_stages::hand::Hand;
@@ -149,7 +156,8 @@ mod tests {
         let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
         let model = Model::load(&project("models/barrett-bh8-280.json")).expect("a model");
         let read = Examples::read(&hand, &[project("recordings/held-out.mcap")], |_, _| {}).expect("readable");
-        let found = Baselines::new(&model, &read.examples, &[]).expect("both kinds");
+        let found = Baselines::new(&model, &read, &[]).expect("both kinds");
+        assert_eq!(found.curve, [], "these grasps were not lifted");
         assert_eq!((found.look.as_str(), found.n_grasps), ("settled", read.examples.len()));
         let names: Vec<&str> = found.rules.iter().map(|rule| rule.name.as_str()).collect();
         assert_eq!(names, ["model", "sum of the cells"], "the other rules need a test lift");
@@ -157,7 +165,7 @@ mod tests {
         assert!(found.in_words().contains("no plain rule lifts as many"));
         // A rule that knows the labels.
         let labels: Vec<f64> = read.examples.iter().map(|example| f64::from(u8::from(example.stable))).collect();
-        let found = Baselines::new(&model, &read.examples, &labels).expect("both kinds");
+        let found = Baselines::new(&model, &read, &labels).expect("both kinds");
         assert_eq!((found.rules[2].roc_area, found.rules[2].recall), (Some(1.0), 1.0));
         assert!(found.in_words().contains("as good as the model, or better: joints alone"), "{}", found.in_words());
     }

@@ -1,12 +1,15 @@
 //! How well a model judges a grasp at each look: when the hand has settled, and after each probe.
 
+use std::collections::BTreeMap;
+
 use serde::Serialize;
 
 use super::measures::{area_under_roc, curve};
 use super::reliability::{N_RELIABILITY_BINS, reliability};
-use crate::training::{Example, LOOKS, values_at};
+use crate::training::{Attempted, Example, LOOKS, Thresholds, threshold_curve, values_at};
 use blindgrasp_messages::Phase;
 use blindgrasp_stages::model::Model;
+use blindgrasp_stages::training_summary::ThresholdPoint;
 
 /// The judgement of the grasps that have this look.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -39,6 +42,25 @@ impl JudgedLook {
     /// Whether the model's thresholds lift a grasp.
     pub(super) fn lifts(&self, idx: usize) -> bool {
         self.is_promising[idx] && self.probabilities[idx] >= Some(self.threshold)
+    }
+
+    /// What thresholds of this look lead to, the model's own among them. Those of the looks before stay.
+    pub(super) fn curve(&self, examples: &[Example]) -> Vec<ThresholdPoint> {
+        let mut objects = BTreeMap::new();
+        let mut grasps = Vec::new();
+        for (idx, example) in examples.iter().enumerate() {
+            let n_objects = objects.len();
+            grasps.push(Attempted {
+                object: *objects.entry(&example.object).or_insert(n_objects),
+                fold: 0,
+                settled: f64::from(u8::from(self.is_promising[idx])),
+                squeezed: 1.0,
+                decided: self.probabilities[idx],
+                stable: example.stable,
+            });
+        }
+        let own = Thresholds { promising: 1.0, promising_squeezed: 0.0, lift: self.threshold };
+        threshold_curve(&grasps, own, self.phase)
     }
 }
 
@@ -93,5 +115,33 @@ impl Look {
             n_lifted,
             n_kept,
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_curve_lifts_promising_grasps_alone_and_has_the_models_threshold() {
+        let judged = JudgedLook {
+            phase: Phase::TestLifted,
+            threshold: 0.6,
+            probabilities: vec![Some(0.9), Some(0.55), Some(0.9), None],
+            is_promising: vec![true, true, false, true],
+        };
+        let examples = [("cup", true), ("box", false), ("box", true), ("cup", true)].map(|(object, stable)| Example {
+            object: object.into(),
+            stable,
+            ..Example::default()
+        });
+        let third = 1.0 / 3.0;
+        let figures = |point: &ThresholdPoint| (point.threshold_probability, point.kept, point.recall);
+        // Each object is lifted as often: the cup is kept, and the box dropped if it is lifted at all.
+        assert_eq!(
+            judged.curve(&examples).iter().map(figures).collect::<Vec<_>>(),
+            [(0.3, 0.5), (0.5, 0.5), (0.6, 1.0), (0.7, 1.0), (0.8, 1.0), (0.9, 1.0)]
+                .map(|(threshold, kept)| (threshold, kept, third))
+        );
     }
 }

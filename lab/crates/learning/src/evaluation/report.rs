@@ -22,7 +22,7 @@ use blindgrasp_stages::label::Label;
 use blindgrasp_stages::model::Model;
 use blindgrasp_stages::recipe::{BlendParams, Learner, Recipe};
 
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct Report {
     pub made: Made,
     /// The decisions as the graph makes them, by class and by reason; only of a model.
@@ -48,7 +48,7 @@ pub struct Report {
     pub dictionary: DictionaryUse,
 }
 
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct Made {
     pub command: String,
     pub version: String,
@@ -114,7 +114,7 @@ pub struct TableRow {
 }
 
 /// A contact dictionary and the use of its words.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct DictionaryUse {
     /// The model or fold that it is of.
     pub from: String,
@@ -162,10 +162,6 @@ pub fn report_on_recipes(
         row(format!("Training, mean of {} folds", options.n_folds), [n_examples, n_stable].map(|n| n * in_training));
     Report {
         made: made(origin, read, unit, Some(options), outside),
-        graph: None,
-        trained: None,
-        looks: Vec::new(),
-        baselines: None,
         data: data(any, read.n_excluded.clone()),
         table_1: table_1(Some(training), &judges),
         comparisons: comparisons(&judges, unit, options.seed),
@@ -175,6 +171,7 @@ pub fn report_on_recipes(
             joints: median_joints(&read.examples),
             words: held_out.words.clone(),
         },
+        ..Report::default()
     }
 }
 
@@ -228,15 +225,11 @@ pub fn report_on_predictions(origin: Origin, read: &Examples, outside: &OutsideP
     let judges = outside_judges(Some(outside), &undecided(read), unit, INTERVAL_SEED);
     Report {
         made: made(origin, read, unit, None, Some(outside)),
-        graph: None,
-        trained: None,
-        looks: Vec::new(),
-        baselines: None,
         data: data(judges.first().map_or(&[][..], |judge| judge.decided.as_slice()), read.n_excluded.clone()),
         table_1: table_1(None, &judges),
         comparisons: comparisons(&judges, unit, INTERVAL_SEED),
         judges,
-        dictionary: DictionaryUse { from: String::new(), joints: Vec::new(), words: Vec::new() },
+        ..Report::default()
     }
 }
 

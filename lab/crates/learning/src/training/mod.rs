@@ -18,7 +18,7 @@ pub use adaptation::{adapt, adapt_on};
 pub use blindgrasp_stages::recipe::{BlendParams, Learner, Recipe};
 pub use blindgrasp_stages::training_summary::{PolicySummary, TrainingSummary};
 pub use examples::{Example, Examples, Signals};
-pub(crate) use probes::{LOOKS, reading_at, values_at};
+pub(crate) use probes::{Attempted, LOOKS, Thresholds, reading_at, threshold_curve, values_at};
 pub use thresholds::Aim;
 
 use crate::evaluation::reliability::{N_RELIABILITY_BINS, reliability};

@@ -30,8 +30,8 @@ const MOST_ATTEMPTS: u32 = 20;
 /// Costs that differ by a smaller part than this count as equal. The cost is flat near its least value: two simulations of the same
 /// 10,000 lifts, with other noise of the cells, had their least costs where 3.1 and 5.1 % of the lifts drop.
 const EQUAL_COST: f64 = 0.02;
-/// The thresholds of a curve, beside the chosen one.
-const N_POINTS: usize = 8;
+/// The thresholds of a curve, beside the chosen one. They are fixed, so that curves of different recordings can be compared.
+const CURVE: [f64; 7] = [0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98];
 /// Probes are judged by trees that learn from many more values than a settled grasp has.
 const PARAMS: BoostingParams = BoostingParams {
     n_rounds: 400,
@@ -213,13 +213,13 @@ fn add_moves(
 
 /// The thresholds of the looks at a grasp.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Thresholds {
+pub(crate) struct Thresholds {
     /// A settled grasp below this is given up.
-    pub(super) promising: f64,
+    pub(crate) promising: f64,
     /// A tight grasp below this is given up before the test lift. 0 without a test lift.
-    pub(super) promising_squeezed: f64,
+    pub(crate) promising_squeezed: f64,
     /// From here on the grasp is lifted.
-    pub(super) lift: f64,
+    pub(crate) lift: f64,
 }
 
 /// The thresholds of a policy, and what to expect of it.
@@ -249,17 +249,17 @@ impl Expected {
 
 /// One grasp of a policy: its object, its probability at each look, and its outcome.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Attempted {
+pub(crate) struct Attempted {
     /// A number below that of all objects.
-    pub(super) object: usize,
+    pub(crate) object: usize,
     /// The fold of its object.
-    pub(super) fold: usize,
-    pub(super) settled: f64,
+    pub(crate) fold: usize,
+    pub(crate) settled: f64,
     /// When it is tight, before a test lift that decides. 1 without one.
-    pub(super) squeezed: f64,
+    pub(crate) squeezed: f64,
     /// When it is decided; `None` if that look has no feature.
-    pub(super) decided: Option<f64>,
-    pub(super) stable: bool,
+    pub(crate) decided: Option<f64>,
+    pub(crate) stable: bool,
 }
 
 /// The looks that may decide.
@@ -273,7 +273,6 @@ pub(super) struct Policies {
     all: Vec<Policy>,
     /// The grasps of each fold, and the policies that the other folds offer.
     folds: Vec<(Vec<Attempted>, Vec<Policy>)>,
-    /// The most attempts of a trial: so many grasps of nine objects in ten were recorded.
     n_attempts: u32,
 }
 
@@ -281,17 +280,13 @@ impl Policies {
     /// Without a probe, `decided` is `settled`, and no grasp is given up before. With one, no grasp is given up from
     /// the first of `stable_from` on when it has settled, and from the second on when it is tight: it counts as stable there.
     pub(super) fn new(grasps: &[Attempted], last: Phase, stable_from: [f64; 2]) -> Policies {
-        let all = Thresholds { promising: 0.0, promising_squeezed: 0.0, lift: 0.0 };
-        let mut n_grasps: Vec<u32> = counts(grasps, all).iter().map(|count| count.n as u32).collect();
-        n_grasps.sort_unstable();
-        let n_attempts = n_grasps.get(n_grasps.len() / 10).copied().unwrap_or(0).min(MOST_ATTEMPTS);
         let n_folds = grasps.iter().map(|grasp| grasp.fold + 1).max().unwrap_or(0);
         let mut folds = Vec::new();
         for fold in 0..n_folds {
             let (own, others): (Vec<_>, Vec<_>) = grasps.iter().partition(|grasp| grasp.fold == fold);
             folds.push((own, policies(&others, last, stable_from)));
         }
-        Policies { all: policies(grasps, last, stable_from), folds, n_attempts }
+        Policies { all: policies(grasps, last, stable_from), folds, n_attempts: most_attempts(grasps) }
     }
 
     /// The policy that takes the least time for each kept object if each drop takes `drop_secs` more, or hardly more time with
@@ -310,35 +305,40 @@ impl Policies {
         }
         Some(Promise { n_attempts: Some(self.n_attempts), ..promise(&tried)? })
     }
+}
 
-    /// What other thresholds of the deciding look lead to than the chosen one, which is among them: those that lift evenly spread
-    /// parts of the stable grasps.
-    pub(super) fn curve(&self, chosen: Thresholds, last: Phase) -> Vec<ThresholdPoint> {
-        let grasps: Vec<Attempted> = self.folds.iter().flat_map(|(grasps, _)| grasps.iter().copied()).collect();
-        let mut lifts: Vec<f64> =
-            grasps.iter().filter(|grasp| grasp.stable).filter_map(|grasp| grasp.decided).collect();
-        lifts = quantiles(lifts, N_POINTS);
-        lifts.push(chosen.lift);
-        lifts.sort_by(f64::total_cmp);
-        lifts.dedup();
-        let n_stable = grasps.iter().filter(|grasp| grasp.stable).count() as f64;
-        let mut points = Vec::new();
-        for lift in lifts {
-            let thresholds = Thresholds { lift, ..chosen };
-            let Some(expected) = expect(&grasps, thresholds, last) else { continue };
-            let counts = counts(&grasps, thresholds);
-            let tried: Vec<ObjectTrials> = counts.iter().map(|count| count.trials(self.n_attempts)).collect();
-            points.push(ThresholdPoint {
-                threshold_probability: lift,
-                kept: expected.kept,
-                recall: counts.iter().map(|count| count.kept).sum::<f64>() / n_stable,
-                attempts_per_lift: expected.attempts_per_lift,
-                given_up: expected.given_up,
-                drops_at_most: promise(&tried).map(|promise| promise.drops_of_lifts.at_most),
-            });
-        }
-        points
+/// What thresholds of the deciding look lead to, the chosen one among them. A threshold that lifts nothing is left out.
+pub(crate) fn threshold_curve(grasps: &[Attempted], chosen: Thresholds, last: Phase) -> Vec<ThresholdPoint> {
+    let mut lifts = CURVE.to_vec();
+    lifts.push(chosen.lift);
+    lifts.sort_by(f64::total_cmp);
+    lifts.dedup();
+    let n_stable = grasps.iter().filter(|grasp| grasp.stable).count() as f64;
+    let n_attempts = most_attempts(grasps);
+    let mut points = Vec::new();
+    for lift in lifts {
+        let thresholds = Thresholds { lift, ..chosen };
+        let Some(expected) = expect(grasps, thresholds, last) else { continue };
+        let counts = counts(grasps, thresholds);
+        let tried: Vec<ObjectTrials> = counts.iter().map(|count| count.trials(n_attempts)).collect();
+        points.push(ThresholdPoint {
+            threshold_probability: lift,
+            kept: expected.kept,
+            recall: counts.iter().map(|count| count.kept).sum::<f64>() / n_stable,
+            attempts_per_lift: expected.attempts_per_lift,
+            given_up: expected.given_up,
+            drops_at_most: promise(&tried).map(|promise| promise.drops_of_lifts.at_most),
+        });
     }
+    points
+}
+
+/// The most attempts of a trial: so many grasps of nine objects in ten were recorded.
+fn most_attempts(grasps: &[Attempted]) -> u32 {
+    let all = Thresholds { promising: 0.0, promising_squeezed: 0.0, lift: 0.0 };
+    let mut n_grasps: Vec<u32> = counts(grasps, all).iter().map(|count| count.n as u32).collect();
+    n_grasps.sort_unstable();
+    n_grasps.get(n_grasps.len() / 10).copied().unwrap_or(0).min(MOST_ATTEMPTS)
 }
 
 /// The policy that keeps the most among those whose cost equals the least cost: see [`EQUAL_COST`].
@@ -571,21 +571,21 @@ mod tests {
     fn a_curve_has_what_each_threshold_leads_to() {
         let grasps =
             grasps(&[("a", 0.9, 0.9, true), ("a", 0.9, 0.3, true), ("a", 0.9, 0.3, true), ("a", 0.9, 0.3, false)]);
-        let policies = Policies::new(&grasps, Phase::Squeezed, [1.0, 1.0]);
         let chosen = Thresholds { promising: 0.5, promising_squeezed: 0.0, lift: 0.5 };
-        let curve = policies.curve(chosen, Phase::Squeezed);
+        let curve = threshold_curve(&grasps, chosen, Phase::Squeezed);
         let figures = |point: &ThresholdPoint| (point.threshold_probability, point.kept, point.recall);
+        let third = 1.0 / 3.0;
         assert_eq!(
             curve.iter().map(figures).collect::<Vec<_>>(),
-            [(0.3, 0.75, 1.0), (0.5, 1.0, 1.0 / 3.0), (0.9, 1.0, 1.0 / 3.0)]
+            [(0.3, 0.75, 1.0), (0.5, 1.0, third), (0.7, 1.0, third), (0.8, 1.0, third), (0.9, 1.0, third)]
         );
         // A quarter of the grasps is lifted at 0.9, in random order after 2.5 attempts.
-        assert_eq!((curve[0].attempts_per_lift, curve[2].attempts_per_lift), (1.0, 2.5));
+        assert_eq!((curve[0].attempts_per_lift, curve[4].attempts_per_lift), (1.0, 2.5));
         // A drop that costs nothing is worth no attempt, one that costs ten is.
-        let costs = |drop_costs: f64| [0, 2].map(|idx: usize| curve[idx].attempts_per_kept(drop_costs));
+        let costs = |drop_costs: f64| [0, 4].map(|idx: usize| curve[idx].attempts_per_kept(drop_costs));
         assert!(costs(0.0)[0] < costs(0.0)[1] && costs(10.0)[0] > costs(10.0)[1], "{:?} {:?}", costs(0.0), costs(10.0));
         // No threshold of the grasps that are given up before lifts anything.
-        assert!(policies.curve(Thresholds { promising: 1.0, ..chosen }, Phase::Squeezed).is_empty());
+        assert!(threshold_curve(&grasps, Thresholds { promising: 1.0, ..chosen }, Phase::Squeezed).is_empty());
     }
 
     #[test]

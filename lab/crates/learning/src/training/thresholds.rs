@@ -2,12 +2,12 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::probes::{Attempted, LOOKS, LearnedProbes, NO_FEATURE, Policies, Policy};
+use super::probes::{Attempted, LOOKS, LearnedProbes, NO_FEATURE, Policies, Policy, threshold_curve};
 use super::{OutOfFold, TrainingError, out_of_fold_probabilities};
 use crate::evaluation::measures::{area_under_roc, curve};
 use blindgrasp_messages::Phase;
 use blindgrasp_stages::classifier::Classifier;
-use blindgrasp_stages::training_summary::{Bounded, PolicySummary, Promise, ThresholdPoint};
+use blindgrasp_stages::training_summary::{Bounded, PolicySummary, Promise};
 
 /// The aim of thresholds that are chosen for trials, in which a hand grasps again until it lifts.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -31,7 +31,6 @@ struct Chosen {
     policy: Policy,
     drop_secs: f64,
     promise: Option<Promise>,
-    curve: Vec<ThresholdPoint>,
 }
 
 /// Why a look has no policy, and the least bound on drops that it has; 1 for none.
@@ -64,8 +63,7 @@ impl Aim {
                     );
                     return Err(Refusal { why, at_most: 1.0 });
                 };
-                let (promise, curve) = (policies.promise(drop_secs), policies.curve(policy.thresholds, look));
-                return Ok(Chosen { look, policy, drop_secs, promise, curve });
+                return Ok(Chosen { look, policy, drop_secs, promise: policies.promise(drop_secs) });
             }
         };
         let mut passed = None;
@@ -81,8 +79,7 @@ impl Aim {
             // The sequence of tests bounds drops by this share, and not by the bound that the last test alone gives.
             promise.drops_of_lifts = Bounded { at_most: max_drops, ..promise.drops_of_lifts };
             promise.drops_of_trials = Bounded { at_most: max_drops, ..promise.drops_of_trials };
-            let curve = policies.curve(policy.thresholds, look);
-            return Ok(Chosen { look, policy, drop_secs, promise: Some(promise), curve });
+            return Ok(Chosen { look, policy, drop_secs, promise: Some(promise) });
         }
         let look = look.as_str();
         let Some(promise) = policies.promise(DROP_SECS[0]) else {
@@ -102,7 +99,11 @@ impl Aim {
 }
 
 impl Chosen {
-    fn summary(self, roc_area: f64) -> PolicySummary {
+    fn summary(self, roc_area: f64, grasps: &[Attempted], promises: bool) -> PolicySummary {
+        let mut curve = threshold_curve(grasps, self.policy.thresholds, self.look);
+        if !promises {
+            curve.iter_mut().for_each(|point| point.drops_at_most = None);
+        }
         PolicySummary {
             roc_area,
             look: self.look.as_str().into(),
@@ -112,7 +113,7 @@ impl Chosen {
             given_up: self.policy.expected.given_up,
             secs_per_kept: self.policy.expected.secs_per_kept,
             promise: self.promise,
-            curve: self.curve,
+            curve,
         }
     }
 }
@@ -155,9 +156,6 @@ pub(super) fn choose_thresholds(
         if is_before_test_lift || !promises {
             chosen.promise = None;
         }
-        if !promises {
-            chosen.curve.iter_mut().for_each(|point| point.drops_at_most = None);
-        }
         let mut roc_area = settled_roc_area;
         if let Some(learned) = probes.after(chosen.look) {
             learned.set_threshold(policy.lift);
@@ -172,7 +170,8 @@ pub(super) fn choose_thresholds(
         {
             squeezed.probe.classifier.unsure_from_probability = policy.promising_squeezed.max(0.0);
         }
-        summaries.push(chosen.summary(roc_area));
+        let grasps = attempts(judged, &settled, probes, chosen.look);
+        summaries.push(chosen.summary(roc_area, &grasps, promises));
     }
     classifier.unsure_from_probability = unsure_from;
     for refusal in refusals {
