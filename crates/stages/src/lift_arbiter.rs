@@ -177,6 +177,8 @@ pub struct ArbiterState {
     lifted: Option<u64>,
     /// The watch of the last lift.
     watch: Option<LiftWatch>,
+    /// The lifts that were watched before that one: [`WATCH_COUNTS`](crate::lift_watch::WATCH_COUNTS).
+    watched: [u64; 2],
     /// Number of lifts whose outcome did not come before the next lift.
     n_unreported: u64,
     promise: PromiseMonitor,
@@ -189,6 +191,11 @@ impl ArbiterState {
 
     pub fn n_unreported(&self) -> u64 {
         self.n_unreported
+    }
+
+    /// The numbers of [`WATCH_COUNTS`](crate::lift_watch::WATCH_COUNTS), without the last lift.
+    pub fn watched(&self) -> [u64; 2] {
+        self.watched
     }
 }
 
@@ -642,7 +649,10 @@ impl LiftArbiter {
             let before = self.state.lifted.replace(grasp_id);
             let watch = self.state.watch.replace(LiftWatch::new(epoch, grasp_id, decision.probability_stable));
             // A lift that was broken off has no outcome, unless the object was dropped.
-            let is_unreported = before.is_some() && !watch.is_some_and(|watch| watch.is_set_down());
+            let is_unreported = before.is_some() && !watch.as_ref().is_some_and(LiftWatch::is_set_down);
+            if let Some(watch) = watch {
+                watch.count_lift(&mut self.state.watched);
+            }
             self.state.n_unreported += u64::from(is_unreported);
         }
     }
@@ -965,6 +975,8 @@ mod tests {
         // A lift that was broken off has no outcome that could be missing.
         s.takes("N+++[2 Lift Stable]N+++[3 Lift Stable]");
         assert_eq!(s.arbiter.state().n_unreported(), 1);
+        // The arm did not lift the other two.
+        assert_eq!(s.arbiter.state().watched(), [1, 1]);
     }
 
     #[test]
