@@ -730,6 +730,7 @@ mod tests {
             'm' => faulty(Phase::TestLifted, Fault::MissingReading),
             'a' => of(Phase::Lifting, 0.9),
             'w' | 'y' => Prediction { unsure: true, ..of(Phase::Lifting, 0.4) },
+            'z' => Prediction { unsure: true, ..of(Phase::Lifting, 0.45) },
             'v' => of(Phase::Lifting, 0.1),
             'x' => faulty(Phase::Lifting, Fault::SensorFault),
             'e' => of(Phase::Ended, 0.9),
@@ -977,6 +978,18 @@ mod tests {
         assert_eq!(s.arbiter.state().n_unreported(), 1);
         // The arm did not lift the other two.
         assert_eq!(s.arbiter.state().watched(), [1, 1]);
+    }
+
+    #[test]
+    fn a_hand_tightens_in_steps_while_the_load_does_not_fall() {
+        let mut s = stream(ArbiterOptions::default());
+        // Six readings after a step the next one may follow, and none after the third.
+        s.takes(
+            "+++[0 Lift Stable]www[0 Tighten Slipping]wwwwww[0 Tighten Slipping]wwwwzz[0 Tighten Slipping]zzzzzzzzz",
+        );
+        // A load that recovers for a time is no reason for another step, nor is one that falls.
+        s.takes("N+++[1 Lift Stable]zzz[1 Tighten Slipping]zzzzzazzzzzzzz");
+        s.takes("z[1 Tighten Slipping]zzzzzwzzzzzzzzzvvv[1 SetDown Slipping]");
     }
 
     #[test]

@@ -2,8 +2,11 @@
 //!
 //! The classifier judges each frame of the phase `lifting` by the load that is left
 //! ([`GraspHistory::judge_lifting`](crate::probe::GraspHistory::judge_lifting)). As many consecutive readings as an arbiter
-//! takes votes for a decision ask for a reaction: `tighten`, once, when it is unsure, and `set_down` when it is unstable.
+//! takes votes for a decision ask for a reaction: `tighten` when it is unsure, and `set_down` when it is unstable.
 //! A reading that is faulty, late or out of order has no vote. The watch never lifts: a grasp that was held stays so.
+//!
+//! Fingers that press harder may press a light, smooth object out of the hand. So each `tighten` asks for a step, and another
+//! follows while the load stays low, unless the load has fallen since the step before.
 
 use serde::{Deserialize, Serialize};
 
@@ -28,6 +31,9 @@ pub fn creep([n_watched, n_tightened]: [u64; 2]) -> Option<String> {
     ))
 }
 
+/// The most orders to tighten in one lift. Each takes an equal part of the way from the force at the first one to that of a lift.
+pub const TIGHTEN_STEPS: u32 = 3;
+
 /// The watch of one lift.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub(crate) struct LiftWatch {
@@ -42,7 +48,10 @@ pub(crate) struct LiftWatch {
     has_begun: bool,
     /// Whether a reading has had a vote since the source asked.
     is_judged: bool,
-    has_tightened: bool,
+    /// The orders to tighten; [`TIGHTEN_STEPS`] also once no more may follow.
+    n_steps: u32,
+    /// The part of the load that was felt at the last order to tighten.
+    part_at_step: f64,
     is_set_down: bool,
 }
 
@@ -55,7 +64,7 @@ impl LiftWatch {
     /// Counts the lift among those that [`WATCH_COUNTS`] names.
     pub(crate) fn count_lift(&self, [n_watched, n_tightened]: &mut [u64; 2]) {
         *n_watched += u64::from(self.has_begun);
-        *n_tightened += u64::from(self.has_tightened);
+        *n_tightened += u64::from(self.n_steps > 0);
     }
 
     /// Whether the arm was told to set the object down.
@@ -90,9 +99,7 @@ impl LiftWatch {
                     self.is_set_down = true;
                     return Some(self.says(Action::SetDown, Reason::Slipping));
                 }
-                let tightens = self.n_slipping >= votes && !self.has_tightened;
-                self.has_tightened |= tightens;
-                tightens.then(|| self.says(Action::Tighten, Reason::Slipping))
+                if self.tightens(votes) { Some(self.says(Action::Tighten, Reason::Slipping)) } else { None }
             }
             Phase::Ended if self.has_begun => {
                 let is_stable = std::mem::take(&mut self.is_judged) && self.n_slipping == 0;
@@ -100,6 +107,21 @@ impl LiftWatch {
             }
             _ => None,
         }
+    }
+
+    /// Whether the hand should tighten by a step. Before another one, the hand has the time of `votes` readings to obey, and as
+    /// many show what became of the load.
+    fn tightens(&mut self, votes: u32) -> bool {
+        if self.n_steps == TIGHTEN_STEPS || self.n_slipping < votes * (1 + 2 * self.n_steps) {
+            return false;
+        }
+        if self.n_steps > 0 && self.probability_stable < self.part_at_step {
+            self.n_steps = TIGHTEN_STEPS;
+            return false;
+        }
+        self.n_steps += 1;
+        self.part_at_step = self.probability_stable;
+        true
     }
 
     fn count(&mut self, header: &Header, prediction: &Prediction, is_trusted: bool) {
