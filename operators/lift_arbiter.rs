@@ -11,6 +11,7 @@ use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::stage::{self, Answers, Stage, decode_state, encode_state};
 use blindgrasp_operator::wiring::Clock;
 use blindgrasp_stages::lift_arbiter::{ArbiterOptions, ArbiterState, LiftArbiter, Probe};
+use blindgrasp_stages::lift_watch::{WATCH_COUNTS, creep};
 use blindgrasp_stages::promise_monitor::{OUTCOME_COUNTS, PromiseMonitor};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
@@ -104,6 +105,7 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
         ended: EndedPromises::default(),
         reported: Default::default(),
         has_said_loosened: false,
+        has_said_creep: false,
     };
     stage::run(operator, "prediction", "decision", 0, BTreeMap::new(), stage)
 }
@@ -134,10 +136,12 @@ struct Arbiter {
     last_arrival_nanos: u64,
     decided: Vec<LiftDecision>,
     ended: EndedPromises,
-    /// The outcomes that are counted in the node's status, and the number of lifts without one.
-    reported: (PromiseMonitor, u64),
+    /// The outcomes that are counted in the node's status, the number of lifts without one, and the lifts that were watched.
+    reported: (PromiseMonitor, u64, [u64; 2]),
     /// Whether it has said that its threshold is below the model's.
     has_said_loosened: bool,
+    /// Whether it has said that contacts creep.
+    has_said_creep: bool,
 }
 
 /// The outcomes of lifts under promises that another one has replaced.
@@ -272,8 +276,8 @@ impl Arbiter {
     /// Counts outcomes of lifts in the node's status, and says once that the promise is withdrawn.
     fn report(&mut self) {
         let state = self.arbiter.state();
-        let promise = state.promise();
-        if *promise == self.reported.0 && state.n_unreported() == self.reported.1 {
+        let (promise, watched) = (state.promise(), state.watched());
+        if *promise == self.reported.0 && (state.n_unreported(), watched) == (self.reported.1, self.reported.2) {
             return;
         }
         let (n_kept, n_dropped) = (promise.n_kept, promise.n_dropped);
@@ -301,7 +305,13 @@ impl Arbiter {
                 n_kept + n_dropped
             );
         }
-        self.operator.has_counted_in_all(BTreeMap::from([
+        if let Some(creep) = creep(watched)
+            && !self.has_said_creep
+        {
+            self.has_said_creep = true;
+            tracing::warn!("{creep}");
+        }
+        let mut counts: BTreeMap<String, u64> = BTreeMap::from([
             (OUTCOME_COUNTS[0].into(), kept_since_change),
             (OUTCOME_COUNTS[1].into(), dropped_since_change),
             (OUTCOME_COUNTS[2].into(), drops_at_most_ppm),
@@ -310,8 +320,12 @@ impl Arbiter {
             ("lifts/dropped".into(), self.ended.n_dropped + n_dropped),
             ("lifts/unreported".into(), state.n_unreported()),
             ("promise_withdrawn".into(), self.ended.n_withdrawn + u64::from(promise.is_withdrawn())),
-        ]));
-        self.reported = (promise.clone(), state.n_unreported());
+        ]);
+        if watched[0] > 0 {
+            counts.extend(WATCH_COUNTS.map(String::from).into_iter().zip(watched));
+        }
+        self.operator.has_counted_in_all(counts);
+        self.reported = (promise.clone(), state.n_unreported(), watched);
     }
 
     /// Answers under the header of the last prediction, but with numbers that count the decisions.

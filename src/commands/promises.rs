@@ -1,4 +1,4 @@
-//! The promise that a robot's own lifts allow, from the counts of a graph's lift arbiter.
+//! The promise that a robot's own lifts allow, and whether its contacts creep, from the counts of a graph's lift arbiter.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -6,6 +6,7 @@ use std::fmt;
 use serde::Serialize;
 
 use blindgrasp_graph::client::words;
+use blindgrasp_stages::lift_watch::{WATCH_COUNTS, creep};
 use blindgrasp_stages::promise_monitor::{CONFIDENCE, OUTCOME_COUNTS};
 
 /// The bound that the reported lifts of a robot allow, since `promised_drops` was set and the readings changed.
@@ -55,15 +56,31 @@ impl fmt::Display for RobotPromise {
     }
 }
 
-/// The counts of a node in words, and the promise that follows from them.
+/// That the contacts of a robot creep, if the counts of a node say so.
+pub(super) fn creep_in(counts: &BTreeMap<String, u64>) -> Option<String> {
+    creep(WATCH_COUNTS.map(|name| counts.get(name).copied().unwrap_or(0)))
+}
+
+/// The counts of a node in words, and what follows from them.
 pub(super) fn shown_counts(counts: &BTreeMap<String, u64>) -> Vec<String> {
     let promise = RobotPromise::of(counts).map(|promise| promise.to_string());
-    promise.into_iter().chain(words::shown_counts(counts)).collect()
+    promise.into_iter().chain(creep_in(counts)).chain(words::shown_counts(counts)).collect()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_robot_creeps_that_was_tightened_in_most_lifts() {
+        let counts = |numbers: [u64; 2]| WATCH_COUNTS.map(String::from).into_iter().zip(numbers).collect();
+        assert_eq!(
+            [creep_in(&counts([9, 9])), creep_in(&counts([10, 5])), creep_in(&BTreeMap::new())],
+            [None, None, None]
+        );
+        let said = creep_in(&counts([10, 6])).expect("most");
+        assert!(said.ends_with("the hand was told to tighten in 6 of 10 lifts: check its rubber and gears"), "{said}");
+    }
 
     #[test]
     fn a_promise_needs_outcomes() {

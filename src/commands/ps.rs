@@ -7,7 +7,7 @@ use clap::Args;
 use serde::Serialize;
 
 use super::elsewhere::MachineArgument;
-use super::promises::RobotPromise;
+use super::promises::{RobotPromise, creep_in};
 use super::text_table::TextTable;
 use super::{Outcome, completions, print_line};
 use blindgrasp_graph::client::usage::{ProcessUsage, usage};
@@ -126,6 +126,9 @@ fn formatted(graph: &RunningGraph) -> Vec<String> {
     )];
     lines.extend(warnings(status).into_iter().map(|warning| format!("  {}", printable(&warning))));
     lines.extend(promises.iter().map(|(node, promise)| format!("  {}: {promise}", printable(node))));
+    for node in &status.nodes {
+        lines.extend(creep_in(&node.counts).map(|creep| format!("  {}: {creep}", printable(&node.node))));
+    }
     if let Some(link) = &status.link {
         lines.extend(link_tables(link));
     }

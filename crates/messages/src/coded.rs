@@ -168,7 +168,8 @@ coded_enums! {
         /// Tighten to the force of a lift, lift by a few millimetres, rest, and send frames: the decision follows. A
         /// reader that cannot do this treats it as [`Action::Hold`].
         TestLift = 4, "test_lift";
-        /// Tighten to the force of a lift, hold it from now on, and go on lifting.
+        /// Tighten by a third of the way to the force of a lift, hold this force from now on, and go on lifting. The second and
+        /// the third order in a lift ask for the other thirds. A hand without steps may take the whole way at the first one.
         Tighten = 5, "tighten";
         /// Stop lifting, and set the object down: most of the load on the fingers is gone.
         SetDown = 6, "set_down";

@@ -28,8 +28,8 @@
 //! `blindgrasp_learning`.
 //!
 //! * [`hand`] - any hand, from a URDF and a pad layout: kinematics, cells, self-collision.
-//! * [`contacts`], [`encoder`] (with [`dictionary`] and [`histogram`]), [`classifier`], [`lift_arbiter`] - the stages.
-//!   [`steps`] - the first three, from message to message.
+//! * [`contacts`], [`encoder`] (with [`dictionary`] and [`histogram`]), [`classifier`], [`lift_arbiter`] (with [`lift_watch`]) - the
+//!   stages. [`steps`] - the first three, from message to message.
 //! * [`out_of_distribution`] - whether a grasp is like those that the model was trained on.
 //! * [`odd_readings`] - faults of hands that can be told without training.
 //! * [`model`] - the model file. [`recipe`] and [`training_summary`] - how a model was trained, as the file says.
@@ -52,7 +52,7 @@ pub mod histogram;
 mod judge;
 pub mod label;
 pub mod lift_arbiter;
-mod lift_watch;
+pub mod lift_watch;
 pub mod model;
 pub mod odd_readings;
 pub mod out_of_distribution;

@@ -170,6 +170,8 @@ pub struct ArbiterState {
     lifted: Option<u64>,
     /// The watch of the last lift.
     watch: Option<LiftWatch>,
+    /// The lifts that were watched before that one: [`WATCH_COUNTS`](crate::lift_watch::WATCH_COUNTS).
+    watched: [u64; 2],
     /// Number of lifts whose outcome did not come before the next lift.
     n_unreported: u64,
     promise: PromiseMonitor,
@@ -182,6 +184,11 @@ impl ArbiterState {
 
     pub fn n_unreported(&self) -> u64 {
         self.n_unreported
+    }
+
+    /// The numbers of [`WATCH_COUNTS`](crate::lift_watch::WATCH_COUNTS), without the last lift.
+    pub fn watched(&self) -> [u64; 2] {
+        self.watched
     }
 }
 
@@ -633,7 +640,10 @@ impl LiftArbiter {
             let before = self.state.lifted.replace(grasp_id);
             let watch = self.state.watch.replace(LiftWatch::new(epoch, grasp_id, decision.probability_stable));
             // A lift that was broken off has no outcome, unless the object was dropped.
-            let is_unreported = before.is_some() && !watch.is_some_and(|watch| watch.is_set_down());
+            let is_unreported = before.is_some() && !watch.as_ref().is_some_and(LiftWatch::is_set_down);
+            if let Some(watch) = watch {
+                watch.count_lift(&mut self.state.watched);
+            }
             self.state.n_unreported += u64::from(is_unreported);
         }
     }
@@ -738,6 +748,7 @@ mod tests {
             'm' => faulty(Phase::TestLifted, Fault::MissingReading),
             'a' => of(Phase::Lifting, 0.9),
             'w' | 'y' => Prediction { unsure: true, ..of(Phase::Lifting, 0.4) },
+            'z' => Prediction { unsure: true, ..of(Phase::Lifting, 0.45) },
             'v' => of(Phase::Lifting, 0.1),
             'x' => faulty(Phase::Lifting, Fault::SensorFault),
             'e' => of(Phase::Ended, 0.9),
@@ -1001,6 +1012,20 @@ mod tests {
         // A lift that was broken off has no outcome that could be missing.
         s.takes("N+++[2 Lift Stable]N+++[3 Lift Stable]");
         assert_eq!(s.arbiter.state().n_unreported(), 1);
+        // The arm did not lift the other two.
+        assert_eq!(s.arbiter.state().watched(), [1, 1]);
+    }
+
+    #[test]
+    fn a_hand_tightens_in_steps_while_the_load_does_not_fall() {
+        let mut s = stream(ArbiterOptions::default());
+        // Six readings after a step the next one may follow, and none after the third.
+        s.takes(
+            "+++[0 Lift Stable]www[0 Tighten Slipping]wwwwww[0 Tighten Slipping]wwwwzz[0 Tighten Slipping]zzzzzzzzz",
+        );
+        // A load that recovers for a time is no reason for another step, nor is one that falls.
+        s.takes("N+++[1 Lift Stable]zzz[1 Tighten Slipping]zzzzzazzzzzzzz");
+        s.takes("z[1 Tighten Slipping]zzzzzwzzzzzzzzzvvv[1 SetDown Slipping]");
     }
 
     #[test]

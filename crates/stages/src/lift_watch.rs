@@ -2,15 +2,40 @@
 //!
 //! The classifier judges each frame of the phase `lifting` by the load that is left
 //! ([`GraspHistory::judge_lifting`](crate::probe::GraspHistory::judge_lifting)). As many consecutive readings as an arbiter
-//! takes votes for a decision ask for a reaction: `tighten`, once, when it is unsure, and `set_down` when it is unstable.
+//! takes votes for a decision ask for a reaction: `tighten` when it is unsure, and `set_down` when it is unstable.
 //! A reading that is faulty, late or out of order has no vote. The watch never lifts: a grasp that was held stays so.
+//!
+//! Fingers that press harder may press a light, smooth object out of the hand. So each `tighten` asks for a step, and another
+//! follows while the load stays low, unless the load has fallen since the step before.
 
 use serde::{Deserialize, Serialize};
 
 use blindgrasp_messages::{Action, Fault, Header, LiftDecision, Phase, Prediction, Reason};
 
+/// The counts of an arbiter's node: lifts that were watched, and those of them in which the hand was told to tighten.
+pub const WATCH_COUNTS: [&str; 2] = ["lifts/watched", "lifts/tightened"];
+
+/// Fewer lifts say nothing of a robot. In simulated worlds the hand is told to tighten in at most 20 % of the lifts where
+/// nothing creeps, and in 39 to 80 % of those where contacts creep.
+const FEWEST_LIFTS: u64 = 10;
+
+/// That a robot's contacts creep, in words, if the hand was told to tighten in most lifts. The numbers are those of
+/// [`WATCH_COUNTS`].
+pub fn creep([n_watched, n_tightened]: [u64; 2]) -> Option<String> {
+    if n_watched < FEWEST_LIFTS || 2 * n_tightened <= n_watched {
+        return None;
+    }
+    Some(format!(
+        "this robot's contacts creep: the hand was told to tighten in {n_tightened} of {n_watched} lifts: check its rubber and \
+         gears"
+    ))
+}
+
+/// The most orders to tighten in one lift. Each takes an equal part of the way from the force at the first one to that of a lift.
+pub const TIGHTEN_STEPS: u32 = 3;
+
 /// The watch of one lift.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub(crate) struct LiftWatch {
     epoch: u64,
     grasp_id: u64,
@@ -23,25 +48,23 @@ pub(crate) struct LiftWatch {
     has_begun: bool,
     /// Whether a reading has had a vote since the source asked.
     is_judged: bool,
-    has_tightened: bool,
+    /// The orders to tighten; [`TIGHTEN_STEPS`] also once no more may follow.
+    n_steps: u32,
+    /// The part of the load that was felt at the last order to tighten.
+    part_at_step: f64,
     is_set_down: bool,
 }
 
 impl LiftWatch {
     /// The watch of a grasp that may be lifted, by its source's epoch.
     pub(crate) fn new(epoch: u64, grasp_id: u64, probability_stable: f64) -> LiftWatch {
-        LiftWatch {
-            epoch,
-            grasp_id,
-            made_by: 0,
-            n_slipping: 0,
-            n_unstable: 0,
-            probability_stable,
-            has_begun: false,
-            is_judged: false,
-            has_tightened: false,
-            is_set_down: false,
-        }
+        LiftWatch { epoch, grasp_id, probability_stable, ..LiftWatch::default() }
+    }
+
+    /// Counts the lift among those that [`WATCH_COUNTS`] names.
+    pub(crate) fn count_lift(&self, [n_watched, n_tightened]: &mut [u64; 2]) {
+        *n_watched += u64::from(self.has_begun);
+        *n_tightened += u64::from(self.n_steps > 0);
     }
 
     /// Whether the arm was told to set the object down.
@@ -76,9 +99,7 @@ impl LiftWatch {
                     self.is_set_down = true;
                     return Some(self.says(Action::SetDown, Reason::Slipping));
                 }
-                let tightens = self.n_slipping >= votes && !self.has_tightened;
-                self.has_tightened |= tightens;
-                tightens.then(|| self.says(Action::Tighten, Reason::Slipping))
+                if self.tightens(votes) { Some(self.says(Action::Tighten, Reason::Slipping)) } else { None }
             }
             Phase::Ended if self.has_begun => {
                 let is_stable = std::mem::take(&mut self.is_judged) && self.n_slipping == 0;
@@ -86,6 +107,21 @@ impl LiftWatch {
             }
             _ => None,
         }
+    }
+
+    /// Whether the hand should tighten by a step. Before another one, the hand has the time of `votes` readings to obey, and as
+    /// many show what became of the load.
+    fn tightens(&mut self, votes: u32) -> bool {
+        if self.n_steps == TIGHTEN_STEPS || self.n_slipping < votes * (1 + 2 * self.n_steps) {
+            return false;
+        }
+        if self.n_steps > 0 && self.probability_stable < self.part_at_step {
+            self.n_steps = TIGHTEN_STEPS;
+            return false;
+        }
+        self.n_steps += 1;
+        self.part_at_step = self.probability_stable;
+        true
     }
 
     fn count(&mut self, header: &Header, prediction: &Prediction, is_trusted: bool) {

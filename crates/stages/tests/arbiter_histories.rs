@@ -246,20 +246,24 @@ fn may_react(history: &[Input], lifted: &[(usize, u64)], decision: &LiftDecision
     let readings = samples.windows(2).rev().filter(|pair| {
         let (before, now) = (pair[0].header, pair[1].header);
         let is_new = (now.epoch, now.stamp_nanos) != (before.epoch, before.stamp_nanos);
-        pair[1].grasp() == grasp && pair[1].prediction.phase == Phase::Lifting && is_new
+        let is_of_lift = pair[1].grasp() == grasp && pair[1].prediction.phase == Phase::Lifting && is_new;
+        is_of_lift || pair[1].step == 'U'
     });
-    let row: Vec<_> = readings.take(options.votes as usize).collect();
     let is_slipping =
         |prediction: &Prediction| !prediction.stable && (!prediction.unsure || decision.action == Action::Tighten);
-    row.len() == options.votes as usize
-        && last.prediction.phase == Phase::Lifting
-        && row.iter().all(|pair| {
+    let votes = options.votes as usize;
+    let n_in_row = readings
+        .take_while(|pair| {
             let is_same = pair[1].header.made_by == last.header.made_by;
             pair[1].follows(pair[0])
                 && is_plain_prediction(pair[1], options)
                 && is_same
                 && is_slipping(&pair[1].prediction)
         })
+        .count();
+    // Between two steps there are twice as many readings as votes.
+    let is_time = decision.action == Action::SetDown || n_in_row % (2 * votes) == votes;
+    n_in_row >= votes && is_time && last.prediction.phase == Phase::Lifting
 }
 
 /// Each grasp that was heard of is decided once. A grasp that goes on while its source starts anew, even several times,

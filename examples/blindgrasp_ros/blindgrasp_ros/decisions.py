@@ -67,7 +67,7 @@ class Decisions:
         return (self.until_nanos or 0) > boottime_nanos()
 
     def set(self, decision, until_nanos):
-        """Keeps a decision. `go_on` does not take the place of `tighten`, which is said once."""
+        """Keeps a decision. `go_on` does not take the place of `tighten`."""
         with self.condition:
             told = self.last["action"], self.last["grasp_id"]
             if decision["action"] == "go_on" and self.is_valid() and told == ("tighten", decision["grasp_id"]):

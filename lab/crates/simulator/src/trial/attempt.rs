@@ -24,6 +24,7 @@ use crate::tactile_sensor::{Sensor, read_torques, read_wrench};
 use crate::wrench_space::{GraspCase, quality};
 use blindgrasp_messages::{OwnedSenses, Phase, Sense, TactileFrame};
 use blindgrasp_stages::hand::Hand;
+use blindgrasp_stages::lift_watch::TIGHTEN_STEPS;
 
 /// An approach that has gone so far beyond the expected touch ends there: the target has given way.
 const OVERSHOOT_M: f64 = 0.005;
@@ -71,8 +72,8 @@ pub struct Attempt<'a> {
     felt: Option<(Vec<f64>, u64)>,
     /// Whether the target has left the hand while the arm lifted.
     is_lost: bool,
-    /// Whether the fingers hold the force of a lift while the arm lifts.
-    holds_force: bool,
+    /// How often it was told to tighten while the arm lifted.
+    n_tightened: u32,
 }
 
 /// What the hand does until it is asked to do something else.
@@ -130,7 +131,7 @@ pub enum ProbeMove {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Reaction {
     GoOn,
-    /// It tightens to the force of a lift once more.
+    /// It tightens by a step.
     Tighten,
     /// It sets the target down.
     SetDown,
@@ -190,7 +191,7 @@ impl<'a> Attempt<'a> {
             last_velocity: Vector3::zeros(),
             felt: None,
             is_lost: false,
-            holds_force: false,
+            n_tightened: 0,
         })
     }
 
@@ -382,10 +383,12 @@ impl<'a> Attempt<'a> {
         self.enter(Stage::Lift);
     }
 
-    /// Tightens to the force of a lift again, and holds this force from now on: where the target gives way, fingers with a
-    /// gear lose it.
+    /// Tightens by a step, and holds this force from now on: where the target gives way, fingers with a gear lose it. The last of
+    /// [`TIGHTEN_STEPS`] leads to the force of a lift.
     pub fn tighten(&mut self) {
-        self.holds_force = true;
+        self.n_tightened = (self.n_tightened + 1).min(TIGHTEN_STEPS);
+        let part = 1.0 / f64::from(TIGHTEN_STEPS + 1 - self.n_tightened);
+        self.body.tighten(&*self.engine, part, &self.options.physics);
     }
 
     /// The outcome of a lift that is over.
@@ -525,8 +528,8 @@ impl<'a> Attempt<'a> {
             let (motion, lifted) = (path.motion(secs, physics.step_secs), path.place_m(secs + physics.step_secs));
             self.move_palm(motion);
             self.lifted = lifted;
-            if self.holds_force {
-                self.body.grip(&mut *self.engine, 1.0, physics);
+            if self.n_tightened > 0 {
+                self.body.hold_force(&mut *self.engine, physics);
             }
         }
         if self.stage == Stage::Squeeze {

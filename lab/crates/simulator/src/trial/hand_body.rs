@@ -85,6 +85,8 @@ struct Drive {
     /// It was blocked while its follower could go on: the motor has let go of it for good.
     has_broken_away: bool,
     lagging_secs: f64,
+    /// The force at the tip with which it grips.
+    grip_newtons: f64,
 }
 
 impl Drive {
@@ -109,6 +111,7 @@ impl Drive {
             is_stopped: false,
             has_broken_away: false,
             lagging_secs: 0.0,
+            grip_newtons: 0.0,
         }
     }
 
@@ -303,18 +306,34 @@ impl HandBody {
         self.command(engine, 0.0, options);
     }
 
-    /// Grips on for a time step, with a part of the way to the force of lifting: from 0, as it closed, to 1. Where the target
-    /// gives, the joint closes on. A joint that has broken away, or is at its limit, stays.
+    /// Grips on for a time step, with a part of the way to the force of lifting: from 0, as it closed, to 1.
     pub(super) fn grip(&mut self, engine: &mut dyn Engine, part: f64, options: &PhysicsOptions) {
         let more_newtons = (options.lift_grip_newtons - options.grip_newtons).max(0.0) * part;
+        for drive in &mut self.drives {
+            drive.grip_newtons = options.grip_newtons + more_newtons;
+        }
+        self.hold_force(engine, options);
+    }
+
+    /// Each motor is to grip with a part of the way from the force that it has to that of lifting.
+    pub(super) fn tighten(&mut self, engine: &dyn Engine, part: f64, options: &PhysicsOptions) {
+        for drive in &mut self.drives {
+            let twisted = (drive.target - drive.travel(engine)) * drive.stiffness;
+            let newtons = (twisted / drive.lever).clamp(0.0, options.lift_grip_newtons);
+            drive.grip_newtons = newtons + part * (options.lift_grip_newtons - newtons);
+        }
+    }
+
+    /// Grips on for a time step with the force that each motor is to have. Where the target gives, the joint closes on. A joint
+    /// that has broken away, or is at its limit, stays.
+    pub(super) fn hold_force(&mut self, engine: &mut dyn Engine, options: &PhysicsOptions) {
         for drive in &mut self.drives {
             let travel = drive.travel(engine);
             drive.stop(travel);
             if drive.has_broken_away || drive.target >= drive.range {
                 continue;
             }
-            let force = (options.grip_newtons + more_newtons) * drive.lever;
-            let twisted = travel + force / drive.stiffness;
+            let twisted = travel + drive.grip_newtons * drive.lever / drive.stiffness;
             let step = drive.rate * options.closing_rad_per_sec * options.step_secs;
             // It never goes back: the gear is not driven backwards.
             let closed = (drive.target + step).min(twisted).min(drive.range);
@@ -633,6 +652,27 @@ mod tests {
             let parts = body.drives.iter().filter(|drive| !drive.has_broken_away);
             let parts: Vec<f64> = parts.map(|drive| part_of(options.lift_grip_newtons, world, drive)).collect();
             assert!(parts.iter().any(|part| *part >= 0.97), "{parts:?}");
+        });
+    }
+
+    #[test]
+    fn a_hand_tightens_in_equal_steps_and_holds_the_force_of_each() {
+        before_a_ball(0.05, 0.13, |world, body, options| {
+            close_until_stopped(world, body, options);
+            for n_left in [3.0, 2.0, 1.0] {
+                let before: Vec<f64> = body.drives.iter().map(|drive| part_of(1.0, world, drive)).collect();
+                body.tighten(world, 1.0 / n_left, options);
+                for _ in 0..200 {
+                    body.hold_force(world, options);
+                    world.step();
+                }
+                let mut steps = body.drives.iter().zip(before).filter(|(drive, _)| !drive.has_broken_away);
+                let is_equal = |(drive, before): (&Drive, f64)| {
+                    let wanted = before + (options.lift_grip_newtons - before) / n_left;
+                    (part_of(1.0, world, drive) - wanted).abs() < 0.03 * wanted
+                };
+                assert!(steps.any(is_equal), "{n_left} steps left");
+            }
         });
     }
 
