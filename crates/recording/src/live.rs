@@ -221,11 +221,7 @@ impl LiveRecorder {
         let mut written = with_sample!(record, sample => part.file.write(topic, sample, &self.data));
         let is_taken = written.is_ok();
         if is_taken {
-            let messages = match record {
-                Record::Tactile(frame) => self.viewer.of_frame(topic, frame, part.file.is_first_frame()),
-                Record::Contacts(contacts) => self.viewer.of_contacts(topic, contacts),
-                _ => Ok(Vec::new()),
-            };
+            let messages = self.viewer.of_record(topic, record, part.file.is_first_frame());
             for (standard, data) in messages.map_err(|error| invalid(&self.path, error))? {
                 if written.is_ok() {
                     written = part.file.write_standard(standard, &header, &data);

@@ -4,7 +4,7 @@
 
 use std::sync::Arc;
 
-use blindgrasp_messages::{ContactSet, Header, Stamped, TactileFrame};
+use blindgrasp_messages::{ContactSet, Header, Record, Stamped, TactileFrame};
 use serde::Serialize;
 
 use super::types::encode;
@@ -69,7 +69,7 @@ impl ShownHand {
 }
 
 /// The messages for viewers, each with its type.
-pub(super) type ForViewers = Vec<(&'static StandardType, Vec<u8>)>;
+type ForViewers = Vec<(&'static StandardType, Vec<u8>)>;
 
 /// Makes the messages for viewers. The first topic of each type of ours is the one that viewers see.
 #[derive(Default)]
@@ -80,8 +80,21 @@ pub(super) struct ViewerMessages {
 }
 
 impl ViewerMessages {
-    /// The messages that go with a frame. With the first frame of a file goes the description of the hand.
-    pub(super) fn of_frame(
+    /// The messages that go with a sample. With the first frame of a file goes the description of the hand.
+    pub(super) fn of_record(
+        &mut self,
+        topic: &str,
+        record: &Record,
+        is_first_of_file: bool,
+    ) -> Result<ForViewers, String> {
+        match record {
+            Record::Tactile(frame) => self.of_frame(topic, frame, is_first_of_file),
+            Record::Contacts(contacts) => self.of_contacts(topic, contacts),
+            _ => Ok(Vec::new()),
+        }
+    }
+
+    fn of_frame(
         &mut self,
         topic: &str,
         frame: &Stamped<TactileFrame>,
@@ -109,8 +122,7 @@ impl ViewerMessages {
         Ok(messages)
     }
 
-    /// The messages that go with contacts.
-    pub(super) fn of_contacts(&mut self, topic: &str, contacts: &Stamped<ContactSet>) -> Result<ForViewers, String> {
+    fn of_contacts(&mut self, topic: &str, contacts: &Stamped<ContactSet>) -> Result<ForViewers, String> {
         if !is_first(&mut self.contact_topic, topic) {
             return Ok(Vec::new());
         }

@@ -10,11 +10,11 @@ use mcap::records::{MessageHeader, Metadata};
 use mcap::{Attachment, Compression, WriteOptions, Writer};
 
 use blindgrasp_messages::files::{keep_mode, partial_path, private_file};
-use blindgrasp_messages::{Header, Record, Recorded, Stamped, TactileFrame, with_sample};
+use blindgrasp_messages::{Header, Record, Recorded, Stamped, with_sample};
 
 use super::source::with_cause;
 use super::types::{MESSAGE_ENCODING, SCHEMA_ENCODING, encode};
-use super::viewer::{ForViewers, JOINT_STATES, ShownHand, StandardType, ViewerMessages};
+use super::viewer::{JOINT_STATES, ShownHand, StandardType, ViewerMessages};
 use super::{LIBRARY, METADATA_NAME, RecordingError, RecordingInfo};
 
 /// An open recording. The same records give the same bytes.
@@ -72,8 +72,7 @@ impl RecordingWriter {
         writer.attach(attachment).map_err(|error| write_error(&self.path, error))
     }
 
-    /// Attaches the files of a hand. Viewers can draw it with the frames of [`RecordingWriter::write_frame`], and its contacts
-    /// with those of [`RecordingWriter::write_record`].
+    /// Attaches the files of a hand. Viewers can draw it with the samples of [`RecordingWriter::write_record`].
     ///
     /// # Errors
     /// The file cannot be written.
@@ -84,17 +83,6 @@ impl RecordingWriter {
         }
         self.viewer.hand = Some(hand);
         Ok(())
-    }
-
-    /// Appends a frame to a topic, and what viewers need to draw the hand.
-    ///
-    /// # Errors
-    /// As [`RecordingWriter::write`].
-    pub fn write_frame(&mut self, topic: &str, frame: &Stamped<TactileFrame>) -> Result<(), RecordingError> {
-        self.write(topic, frame)?;
-        let is_first = !self.standard_channels.contains_key(JOINT_STATES.topic);
-        let messages = self.viewer.of_frame(topic, frame, is_first);
-        self.write_for_viewers(&frame.header, messages)
     }
 
     /// Appends a sample to a topic.
@@ -109,20 +97,25 @@ impl RecordingWriter {
         self.append(topic, sample).map_err(|error| write_error(&self.path, error))
     }
 
-    /// Appends a sample of any type to a topic.
+    /// Appends a sample of any type to a topic, and the messages by which viewers draw it with the hand.
     ///
     /// # Errors
     /// As [`RecordingWriter::write`].
     pub fn write_record(&mut self, topic: &str, record: &Record) -> Result<(), RecordingError> {
-        match record {
-            Record::Tactile(frame) => self.write_frame(topic, frame),
-            Record::Contacts(contacts) if self.viewer.hand.is_some() => {
-                self.write(topic, contacts)?;
-                let messages = self.viewer.of_contacts(topic, contacts);
-                self.write_for_viewers(&contacts.header, messages)
-            }
-            _ => with_sample!(record, sample => self.write(topic, sample)),
+        with_sample!(record, sample => self.write(topic, sample))?;
+        if self.viewer.hand.is_none() {
+            return Ok(());
         }
+        let is_first = !self.standard_channels.contains_key(JOINT_STATES.topic);
+        let messages = self.viewer.of_record(topic, record, is_first);
+        let messages = messages.map_err(|message| RecordingError::Invalid { path: self.path.clone(), message })?;
+        let Some(writer) = &mut self.writer else { return Ok(()) };
+        for (standard, data) in messages {
+            add_standard(writer, &mut self.standard_channels, standard)
+                .and_then(|id| append(writer, id, record.header(), &data))
+                .map_err(|error| write_error(&self.path, error))?;
+        }
+        Ok(())
     }
 
     /// Adds metadata under a name of its own, beside the recording's [`RecordingInfo`].
@@ -147,21 +140,6 @@ impl RecordingWriter {
         }
         let channels = std::mem::take(&mut self.channels);
         Ok(channels.into_iter().map(|(topic, channel)| (topic, channel.n_samples)).collect())
-    }
-
-    fn write_for_viewers(
-        &mut self,
-        header: &Header,
-        messages: Result<ForViewers, String>,
-    ) -> Result<(), RecordingError> {
-        let messages = messages.map_err(|message| RecordingError::Invalid { path: self.path.clone(), message })?;
-        let Some(writer) = &mut self.writer else { return Ok(()) };
-        for (standard, data) in messages {
-            add_standard(writer, &mut self.standard_channels, standard)
-                .and_then(|id| append(writer, id, header, &data))
-                .map_err(|error| write_error(&self.path, error))?;
-        }
-        Ok(())
     }
 
     fn append<M: Recorded>(&mut self, topic: &str, sample: &Stamped<M>) -> mcap::McapResult<()> {

@@ -17,7 +17,7 @@ use blindgrasp_cli::shard::Shard;
 use blindgrasp_cli::stop_signal;
 use blindgrasp_grasps::dataset::REPORT_METADATA;
 use blindgrasp_grasps::shown_hand::shown_hand;
-use blindgrasp_messages::{GraspScene, GraspTruth, Header, Recorded, Stamped, TactileFrame};
+use blindgrasp_messages::{GraspScene, GraspTruth, Header, Record, Recorded, Stamped, TactileFrame};
 use blindgrasp_objects::{objects_id, objects_named};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_recording::{Manifest, RecordingError, RecordingInfo, RecordingReader, RecordingWriter, part_path};
@@ -460,8 +460,8 @@ impl GraspWriter {
         let start_nanos = self.header.stamp_nanos;
         for timed in grasp.frames {
             self.header.stamp_nanos = start_nanos + timed.offset_nanos;
-            let frame = Stamped { header: self.header, message: timed.frame };
-            self.recording.write_frame(TactileFrame::TOPIC, &frame)?;
+            let frame = Record::Tactile(Stamped { header: self.header, message: timed.frame });
+            self.recording.write_record(TactileFrame::TOPIC, &frame)?;
             self.header.seq += 1;
         }
         self.header.stamp_nanos += PAUSE_NANOS;

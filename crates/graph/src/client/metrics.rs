@@ -349,7 +349,9 @@ mod tests {
 
     #[test]
     fn the_dashboard_asks_for_figures_that_there_are() {
-        let text = text(crate::testing::made_status("gate")).expect("figures");
+        let mut status = crate::testing::made_status("gate");
+        status.nodes[0].counts.insert("lifts/dropped".into(), 2);
+        let text = text(status).expect("figures");
         let mut names = BTreeSet::new();
         for line in text.lines() {
             if let Some((name, kind)) = line.strip_prefix("# TYPE ").and_then(|line| line.split_once(' ')) {
@@ -371,7 +373,8 @@ mod tests {
                 assert!(!found.is_empty() && found.iter().all(|name| names.contains(*name)), "{asked}: {names:?}");
             }
         }
-        for label in ["action=\"hold\",reason=\"no_contact\"", "action=\"lift\",reason=\"stable\""] {
+        let lifts = "kind=\"lifts/dropped\"} 2";
+        for label in ["action=\"hold\",reason=\"no_contact\"", "action=\"lift\",reason=\"stable\"", lifts] {
             assert!(text.contains(label), "{text}");
         }
     }

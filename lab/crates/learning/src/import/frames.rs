@@ -7,7 +7,7 @@ use serde::Serialize;
 
 use super::{ImportError, require_forces};
 use blindgrasp_grasps::shown_hand::shown_hand;
-use blindgrasp_messages::{GraspTruth, Header, Phase, Recorded, Stamped, TactileFrame};
+use blindgrasp_messages::{GraspTruth, Header, Phase, Record, Recorded, Stamped, TactileFrame};
 use blindgrasp_recording::{RecordingInfo, RecordingWriter};
 use blindgrasp_stages::hand::Hand;
 
@@ -66,7 +66,7 @@ pub fn import_frames(
         }
         let has = senses_of(&frame.message);
         senses = Some(senses.map_or(has.clone(), |known| &known & &has));
-        recording.write_frame(TactileFrame::TOPIC, frame)?;
+        recording.write_record(TactileFrame::TOPIC, &Record::Tactile(frame.clone()))?;
     }
     let mut seq = 0;
     for (grasp_id, truth) in truths {

@@ -24,7 +24,7 @@ use crate::file_name;
 use blindgrasp_grasps::shown_hand::shown_hand;
 use blindgrasp_messages::file_kind::FileKind;
 use blindgrasp_messages::files::open_regular;
-use blindgrasp_messages::{GraspTruth, Header, MAX_NAME_BYTES, Phase, Recorded, Stamped, TactileFrame};
+use blindgrasp_messages::{GraspTruth, Header, MAX_NAME_BYTES, Phase, Record, Recorded, Stamped, TactileFrame};
 use blindgrasp_recording::{RecordingError, RecordingInfo, RecordingWriter};
 use blindgrasp_stages::contacts::{LIMIT_TOLERANCE_RAD, MAX_CELL_NEWTONS};
 use blindgrasp_stages::day::day_number;
@@ -484,10 +484,9 @@ impl GraspWriter {
         for TableReading { phase, cells: cells_newtons, joints } in grasp.readings {
             let message =
                 TactileFrame { grasp_id: self.grasp_id, phase, joints, cells_newtons, day, ..TactileFrame::default() };
-            let mut sample = Stamped { header: self.header, message };
             for _ in 0..self.n_frames {
-                sample.header = self.header;
-                self.recording.write_frame(TactileFrame::TOPIC, &sample)?;
+                let sample = Record::Tactile(Stamped { header: self.header, message: message.clone() });
+                self.recording.write_record(TactileFrame::TOPIC, &sample)?;
                 self.header.seq += 1;
                 self.header.stamp_nanos += PERIOD_NANOS;
             }
