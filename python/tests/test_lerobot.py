@@ -2,6 +2,7 @@
 
 import csv
 import importlib.util
+import io
 import json
 import os
 import shlex
@@ -9,10 +10,13 @@ import subprocess
 import sys
 import tempfile
 import unittest
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
+from unittest import mock
 
 import blindgrasp
 import numpy as np
+from blindgrasp import lerobot
 
 PACKAGE = Path(blindgrasp.__file__).resolve().parents[1]
 FPS, N_FRAMES, N_EPISODES = 10, 30, 12
@@ -117,11 +121,14 @@ class LeRobot(unittest.TestCase):
         return root
 
     def convert(self, root, *words, cells="observation.tactile.left,observation.tactile.right/2::3", label="next.success"):
-        command = [sys.executable, "-m", "blindgrasp.lerobot", str(root), str(self.table), "--cells", cells, "--label", label]
+        # As python -m blindgrasp.lerobot; to start Python and read pyarrow each time would take longer than a conversion.
+        command = ["lerobot", str(root), str(self.table), "--cells", cells, "--label", label]
         # The jaw opens 0.0425 m at 100 %.
         command += ["--hand", "parallel-gripper", "--joints", "observation.state/jaw*", "--joint-scale", "0.000425", *words]
-        environment = os.environ | {"PYTHONPATH": str(PACKAGE)}
-        return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=600)
+        stdout, stderr = io.StringIO(), io.StringIO()
+        with mock.patch.object(sys, "argv", command), redirect_stdout(stdout), redirect_stderr(stderr):
+            exit_code = lerobot.main()
+        return subprocess.CompletedProcess(command, exit_code, stdout.getvalue(), stderr.getvalue())
 
     def converted(self, *arguments, **given):
         done = self.convert(*arguments, **given)
@@ -144,7 +151,6 @@ class LeRobot(unittest.TestCase):
     def refused(self, words, *arguments, **given):
         done = self.convert(*arguments, **given)
         self.assertEqual(done.returncode, 1, done.stderr)
-        self.assertNotIn("Traceback", done.stderr)
         self.assertRegex(done.stderr, words)
         self.assertFalse(self.table.exists())
         self.assertEqual([path.name for path in self.folder.glob(".*")], [])
@@ -299,7 +305,7 @@ class LeRobot(unittest.TestCase):
                 self.refused(words, root, *more, **given)
         self.table.mkdir()
         done = self.convert(root, *at, "--overwrite")
-        self.assertEqual((done.returncode, "Traceback" in done.stderr), (1, False))
+        self.assertEqual(done.returncode, 1)
         self.assertIn("table.csv: expected a file that can be written", done.stderr)
         self.table.rmdir()
         self.table.write_text("mine")

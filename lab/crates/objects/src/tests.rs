@@ -1,4 +1,4 @@
-use std::collections::HashMap;
+use std::collections::{BTreeSet, HashMap};
 use std::sync::LazyLock;
 
 use nalgebra::Vector3;
@@ -145,6 +145,7 @@ fn triangles_follow_curved_surfaces() {
     let mut odd = Vec::new();
     for (object, mesh) in CATALOGUE.iter() {
         let (mut worst_m, mut place) = (0.0, Point3::origin());
+        let top_m = mesh.bounds()[1].z;
         let mut apex: HashMap<(u32, u32), usize> = HashMap::new();
         for (triangle_idx, &[a, b, c]) in mesh.triangles.iter().enumerate() {
             for edge in [(a, b), (b, c), (c, a)] {
@@ -164,7 +165,7 @@ fn triangles_follow_curved_surfaces() {
             let corner = mesh.vertices_m[a as usize];
             let inside = [one, other].iter().any(|idx| mesh.normal(*idx).xy().dot(&corner.coords.xy()) < 0.0);
             let hidden = match object.class.as_str() {
-                "mug" | "cup" | "bowl" | "vase" | "teapot" | "jar" => corner.z < mesh.bounds()[1].z - 0.024,
+                "mug" | "cup" | "bowl" | "vase" | "teapot" | "jar" => corner.z < top_m - 0.024,
                 "lamp" => true,
                 _ => false,
             };
@@ -211,7 +212,9 @@ fn vessels_are_hollow_and_what_is_joined_to_them_stays_out_of_the_hollow() {
             if std::ptr::eq(part, wall) {
                 continue;
             }
-            for corner in part.corners().flatten() {
+            let corners: BTreeSet<u32> = part.triangles.iter().flatten().copied().collect();
+            for idx in corners {
+                let corner = part.vertices_m[idx as usize];
                 // Outwards there is at most one way out of the wall; from the hollow there is also one in.
                 // A little beside the corner, so as not to meet an edge.
                 let from = corner + Vector3::new(1.1e-6, 2.3e-6, 1.7e-6);
