@@ -6,9 +6,6 @@ use crate::common::mistakes::read;
 use crate::common::python::{python, utf8};
 use crate::common::{blindgrasp, json_of, report_data, run, text};
 
-/// To build all objects takes longer than to simulate some grasps.
-const FEW_OBJECTS: &str = "box,can,mug";
-
 /// Runs a command in a folder.
 fn run_in(folder: &Path, arguments: &[&str], exit_code: i32) -> (String, String) {
     let mut command = blindgrasp();
@@ -33,9 +30,8 @@ fn hands_that_people_own_lift_in_simulation() {
     ] {
         let folder = tempfile::tempdir().expect("a folder");
         run(&["init", utf8(folder.path()), "--hand", hand], 0);
-        let simulate =
-            ["simulate", "--hand", hand, "--label", "lift", "--protocol", "planned", "--objects", FEW_OBJECTS];
-        let few = ["--stable-fraction", "natural", "--grasps", n_lifts, "--out", "lifts.mcap"];
+        let simulate = ["simulate", "--hand", hand, "--protocol", "planned", "--objects", "box,can,mug"];
+        let few = ["--label", "lift", "--stable-fraction", "natural", "--grasps", n_lifts, "--out", "lifts.mcap"];
         let (said, _) = run_in(folder.path(), &[&simulate[..], &few].concat(), 0);
         let n_grasps = format!("grasps            {n_lifts}, ");
         assert!(said.contains(&n_grasps) && !said.contains(" 0.0 % stable"), "{hand}: {said}");
@@ -138,7 +134,7 @@ fn a_hand_is_made_from_xacro_with_meshes_and_grids() {
         assert!((number("normal", 1) + side).abs() < 1e-6, "{cell}");
     }
     let simulate = ["simulate", "--hand", "mine/mine.yaml", "--protocol", "planned", "--grasps", "10"];
-    let few = ["--objects", FEW_OBJECTS, "--stable-fraction", "natural", "--out", "grasps.mcap"];
+    let few = ["--objects", "box,can,mug", "--stable-fraction", "natural", "--out", "grasps.mcap"];
     run_in(folder.path(), &[&simulate[..], &few].concat(), 0);
 }
 

@@ -212,8 +212,7 @@ fn vessels_are_hollow_and_what_is_joined_to_them_stays_out_of_the_hollow() {
             if std::ptr::eq(part, wall) {
                 continue;
             }
-            let corners: BTreeSet<u32> = part.triangles.iter().flatten().copied().collect();
-            for idx in corners {
+            for idx in part.triangles.iter().flatten().copied().collect::<BTreeSet<u32>>() {
                 let corner = part.vertices_m[idx as usize];
                 // Outwards there is at most one way out of the wall; from the hollow there is also one in.
                 // A little beside the corner, so as not to meet an edge.

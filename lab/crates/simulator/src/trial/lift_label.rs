@@ -255,11 +255,10 @@ mod tests {
 
     #[test]
     fn another_time_step_of_the_lift_leaves_all_before_it_as_it_was() {
-        let objects = select("ball-01,box-03").expect("objects");
         let with = |step_secs: f64, lift_step_secs: Option<f64>| {
             let mut options = lifts(1);
             (options.lift.step_secs, options.lift.lift_step_secs) = (step_secs, lift_step_secs);
-            let mut grasp = simulated(&objects, &options, 1).0.remove(0);
+            let mut grasp = simulated(&select("ball-01,box-03").expect("objects"), &options, 1).0.remove(0);
             let n_before = grasp.frames.iter().position(|timed| timed.frame.phase == Phase::Lifting).expect("it lifts");
             grasp.frames.truncate(n_before);
             grasp
