@@ -57,6 +57,9 @@ pub(super) struct Arguments {
     /// The probe after which the model's arbiter decides: none, squeeze or test_lift; the recordings need its frames.
     #[arg(long, default_value = "none", value_parser = |text: &str| word::<Probe>(text, "none, squeeze or test_lift"), conflicts_with = "split")]
     probe: Probe,
+    /// Probe grasps from this probability on, as lift_arbiter.min_probability_promising says to a graph.
+    #[arg(long, value_name = "PROBABILITY", conflicts_with = "split")]
+    min_promising: Option<f64>,
     /// Train recipes on a part of the grasps and judge the rest, by folds that share no grasp, object or class.
     #[arg(long, value_parser = ["grasp", "object", "class"])]
     split: Option<String>,
@@ -113,18 +116,31 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
              on these recordings, or --predictions of another model",
             arguments.inputs.first().map_or(Path::new(""), PathBuf::as_path).display()
         ),
-        (None, None) if arguments.probe != Probe::None || arguments.drop_costs.is_some() => bail!(
-            "--probe, --drop-costs: predictions are judged as they are: give a model as well, or leave these options out"
-        ),
+        (None, None)
+            if arguments.probe != Probe::None
+                || arguments.min_promising.is_some()
+                || arguments.drop_costs.is_some() =>
+        {
+            bail!(
+                "--probe, --min-promising, --drop-costs: predictions are judged as they are: give a model as well, or leave these \
+                 options out"
+            )
+        }
         (Some(model), None) if recordings.is_empty() => {
             bail!("nothing to judge {} on: name recordings after it", model.display())
         }
         _ => {}
     }
     // Check files before the long work.
-    let model = model.map(|path| Ok::<_, anyhow::Error>((path, Model::load(path)?))).transpose()?;
-    if let Some((path, model)) = &model {
+    let mut model = model.map(|path| Ok::<_, anyhow::Error>((path, Model::load(path)?))).transpose()?;
+    if let Some((path, model)) = &mut model {
         check_probe(path, model, arguments.probe)?;
+        if let Some(least) = arguments.min_promising {
+            model.classifier.unsure_from_probability = least;
+            if let Some(squeezed) = &mut model.squeezed {
+                squeezed.classifier.unsure_from_probability = least;
+            }
+        }
     }
     let recordings = recordings_in(recordings)?;
     let inputs = [recordings.as_slice(), &arguments.inputs, arguments.predictions.as_slice()].concat();
