@@ -86,6 +86,21 @@ impl Recipe {
         };
         Some(Recipe { name: name.into(), blocks, scaled, learner, n_words: 64, ..Recipe::default() })
     }
+
+    /// The recipe with a baseline of the day. Where it has the cells relative to their pads too, it leaves out their readings as
+    /// such, which say more of the day than of the grasp (benches/archive.md, "Another day").
+    #[must_use]
+    pub fn with_day_baseline(mut self) -> Recipe {
+        self.day_baseline = true;
+        if self.blocks.contains(&Block::RelativeCells) {
+            self.blocks.retain(|block| *block != Block::Cells);
+            if let Learner::Blend(BlendParams { svm, .. }) = &mut self.learner {
+                // Squared distances are of half as many values.
+                svm.gamma *= 2.0;
+            }
+        }
+        self
+    }
 }
 
 impl Default for Recipe {
@@ -109,5 +124,17 @@ impl Default for Recipe {
                 ..BoostingParams::default()
             }),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn with_a_baseline_a_blend_judges_cells_relative_to_their_pads_alone() {
+        let [blend, raw] = ["blend", "raw"].map(|name| Recipe::named(name).expect("a recipe").with_day_baseline());
+        assert_eq!(blend.blocks, [Block::RelativeCells, Block::Joints]);
+        assert_eq!(raw.blocks, [Block::Cells, Block::Joints], "a recipe of cells alone keeps them");
     }
 }

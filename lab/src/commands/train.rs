@@ -181,8 +181,10 @@ pub(super) fn is_of_the_papers_label(training: &TrainingSummary) -> bool {
 /// The named recipe with the values of the command line.
 fn recipe(arguments: &Arguments) -> anyhow::Result<Recipe> {
     let mut recipe = Recipe::named(&arguments.recipe).context("no such recipe")?;
+    if arguments.day_baseline {
+        recipe = recipe.with_day_baseline();
+    }
     recipe.n_words = arguments.words.map_or(recipe.n_words, |words| words as usize);
-    recipe.day_baseline = arguments.day_baseline;
     recipe.sigma_m = arguments.sigma_m.unwrap_or(recipe.sigma_m);
     match &mut recipe.learner {
         Learner::Svm(params) | Learner::Blend(BlendParams { svm: params, .. }) => {
