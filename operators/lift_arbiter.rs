@@ -66,8 +66,7 @@ pub(crate) fn describe() -> OperatorDescription {
             "max_age_ms",
             millis(),
             Some((default.max_age_nanos as f64 / 1e6).into()),
-            "How old a prediction may be on arrival, and how long none may come while a grasp is open (or three periods of the source, if \
-             that is more)",
+            "How old a prediction may be on arrival, and how long none may come in an open grasp; three periods of the source, if more",
         )
         .live_param(
             "probe",

@@ -90,7 +90,7 @@ fn a_browser_shows_a_graph_as_it_runs() {
         "/^The model beside: (LIFT|HOLD) for grasp \\d/.test(document.getElementById('shadow').textContent)",
     );
     browser.wait_until("/^decisions in \\d/.test(document.getElementById('latency').textContent)");
-    assert_eq!(browser.text("state"), "running");
+    browser.wait_until("document.getElementById('state').textContent === 'running'");
     browser.wait_until(
         "document.body.className === '' && /^decided \\d+ s ago$/.test(document.getElementById('decided').textContent)",
     );

@@ -39,7 +39,8 @@ pub fn update(
 ) -> Result<String, UpdateError> {
     let reader = RecordingReader::open(recording)?;
     let attachments = attachments(recording)?;
-    let hand = hand.filter(|_| attachments.iter().any(|file| file.name == ShownHand::URDF_NAME));
+    let is_shown = attachments.iter().any(|file| file.name == ShownHand::URDF_NAME);
+    let hand = if is_shown { hand } else { None };
     let is_lost = |(topic, schema): &(&String, &String)| {
         let is_made_anew = hand.is_some() && TOPICS_FOR_VIEWERS.contains(&topic.as_str());
         !schema.starts_with("blindgrasp_msgs/") && !is_made_anew

@@ -259,6 +259,8 @@ def serve(arguments):
     threading.Thread(target=work, args=(top, publishing.diagnose, publishing.has_no_state), daemon=True).start()
     node.create_timer(1.0, publishing.take_back, clock=Clock(clock_type=ClockType.STEADY_TIME))
     spin(node, MultiThreadedExecutor(num_threads=MAX_WAITING + 4))
+    # The threads may be in rclpy, which an orderly end of Python would take from them.
+    os._exit(0)
 
 
 def main():

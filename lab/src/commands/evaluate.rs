@@ -116,16 +116,10 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
              on these recordings, or --predictions of another model",
             arguments.inputs.first().map_or(Path::new(""), PathBuf::as_path).display()
         ),
-        (None, None)
-            if arguments.probe != Probe::None
-                || arguments.min_promising.is_some()
-                || arguments.drop_costs.is_some() =>
-        {
-            bail!(
-                "--probe, --min-promising, --drop-costs: predictions are judged as they are: give a model as well, or leave these \
-                 options out"
-            )
-        }
+        (None, None) if arguments.is_for_a_model() => bail!(
+            "--probe, --min-promising, --drop-costs: predictions are judged as they are: give a model as well, or leave these options \
+             out"
+        ),
         (Some(model), None) if recordings.is_empty() => {
             bail!("nothing to judge {} on: name recordings after it", model.display())
         }
@@ -136,10 +130,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     if let Some((path, model)) = &mut model {
         check_probe(path, model, arguments.probe)?;
         if let Some(least) = arguments.min_promising {
-            model.classifier.unsure_from_probability = least;
-            if let Some(squeezed) = &mut model.squeezed {
-                squeezed.classifier.unsure_from_probability = least;
-            }
+            probe_from(model, least);
         }
     }
     let recordings = recordings_in(recordings)?;
@@ -163,6 +154,20 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         (Some((path, model)), _) => job.model(path, &model),
         (None, Some(split)) => job.recipes(split),
         (None, None) => job.predictions(),
+    }
+}
+
+impl Arguments {
+    fn is_for_a_model(&self) -> bool {
+        self.probe != Probe::None || self.min_promising.is_some() || self.drop_costs.is_some()
+    }
+}
+
+/// Lets the model call a grasp promising from this probability on.
+fn probe_from(model: &mut Model, least: f64) {
+    model.classifier.unsure_from_probability = least;
+    if let Some(squeezed) = &mut model.squeezed {
+        squeezed.classifier.unsure_from_probability = least;
     }
 }
 

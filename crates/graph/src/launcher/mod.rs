@@ -217,7 +217,7 @@ impl Launcher {
     /// Orders the start of all processes of a graph, and answers commands on `control`.
     ///
     /// # Errors
-    /// The socket cannot be used.
+    /// A program cannot be started, or the socket cannot be used; processes already started are killed.
     pub fn start(
         graph: &Graph,
         name: &str,
@@ -271,18 +271,10 @@ impl Launcher {
             server::serve(control, pins, &launcher.life.site.events, audit_log).map_err(LaunchError::Control)?;
         launcher.server = Some(server);
         launcher.life.launch();
-        Ok(launcher)
-    }
-
-    /// Waits until each process has begun, or for `should_stop`: files with a digest are read before.
-    ///
-    /// # Errors
-    /// A program cannot be started.
-    pub fn wait_until_begun(&mut self, should_stop: &dyn Fn() -> bool) -> Result<(), LaunchError> {
-        while self.pids().len() < self.life.members.len() && !should_stop() && !self.life.is_asked_to_stop {
-            self.turn()?;
+        while launcher.pids().len() < graph.nodes.len() {
+            launcher.turn()?;
         }
-        Ok(())
+        Ok(launcher)
     }
 
     /// Node ids and process ids, in the graph's order.

@@ -129,9 +129,7 @@ impl<'a> Run<'a> {
         let log = RunLog::new(sink, Arc::clone(&decisions))?;
         let observer = Observer::start(namespace.wiring(), RUN_BELL, observed_edges(graph, &plan, &topics), log)?;
         let started = Launcher::start(graph, namespace.name(), plan, cursors, namespace.listener(), decisions, launch);
-        let is_asked_to_stop = || n_stops.load(Ordering::Relaxed) > 0;
-        let begun = started.and_then(|mut launcher| launcher.wait_until_begun(&is_asked_to_stop).map(|()| launcher));
-        let mut launcher = match begun {
+        let mut launcher = match started {
             Ok(launcher) => launcher,
             Err(error) => {
                 observer.finish()?;
