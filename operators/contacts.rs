@@ -1,6 +1,6 @@
 //! From tactile frames to contacts in the palm frame.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use blindgrasp_messages::{Contact, ContactSet, Fault, FrameParts, Phase, Recorded, TactileFrame, TactileFrameHead};
@@ -87,10 +87,10 @@ struct FindContacts {
 /// The next line says how many others had some.
 #[derive(Default)]
 struct GraspLog {
-    /// The last grasp with something wrong, whether it is one that is told, and the number of its sentences that have been.
+    /// The last grasp with something wrong, whether it is one that is told, and its sentences that have been, without their numbers.
     grasp: Option<u64>,
     is_told: bool,
-    n_told: usize,
+    told: BTreeSet<String>,
     due_nanos: u64,
     n_more: u64,
 }
@@ -121,7 +121,8 @@ impl GraspLog {
     /// The lines to be printed of a grasp of which this has been found so far.
     fn lines(&mut self, grasp_id: u64, found: &[String], now_nanos: u64) -> Vec<String> {
         if self.grasp != Some(grasp_id) && !found.is_empty() {
-            (self.grasp, self.n_told) = (Some(grasp_id), 0);
+            self.grasp = Some(grasp_id);
+            self.told.clear();
             self.is_told = now_nanos >= self.due_nanos;
             if self.is_told {
                 self.due_nanos = now_nanos + LOG_PAUSE_NANOS;
@@ -131,14 +132,17 @@ impl GraspLog {
         }
         let mut lines = Vec::new();
         if self.is_told && self.grasp == Some(grasp_id) {
-            for sentence in found.iter().skip(self.n_told) {
+            for sentence in found {
+                let words = sentence.split(' ').filter(|word| !word.starts_with(|char: char| char.is_ascii_digit()));
+                if !self.told.insert(words.collect()) {
+                    continue;
+                }
                 let before = match std::mem::take(&mut self.n_more) {
                     0 => String::new(),
                     n_more => format!("; of {n_more} grasps before it nothing was said"),
                 };
                 lines.push(format!("grasp {grasp_id}: {sentence}{before}"));
             }
-            self.n_told = self.n_told.max(found.len());
         }
         lines
     }

@@ -239,19 +239,23 @@ impl<'a> Check<'a> {
         let own = most_drops(model, look.as_str());
         let number = |name: &str| arbiter.params.get(name).and_then(Value::as_f64);
         let promised = number("promised_drops");
-        if let Some(least) = number("min_probability_stable")
-            && least > 0.0
-            && let Some(of_look) = model.look(look)
-            && least < of_look.threshold_probability
-        {
-            let message = format!(
-                "min_probability_stable is {least}, below the threshold of the model of node '{}', {:.4}: the model's bound on drops \
-                 does not hold",
-                classifier.node, of_look.threshold_probability
-            );
-            let help = "expected 0, which takes the model's own threshold".into();
-            self.fit.warnings.push(Misfit { kind: MisfitKind::Bound, node: arbiter.node.clone(), message, help });
-            return;
+        let promising = if look == Phase::Settled { None } else { Some(model.classifier.unsure_from_probability) };
+        for (name, own, doubt) in [
+            ("min_probability_stable", model.look(look).map(|of_look| of_look.threshold_probability), "does not hold"),
+            ("min_probability_promising", promising, "is not proven"),
+        ] {
+            if let (Some(least), Some(own)) = (number(name), own)
+                && least > 0.0
+                && least < own
+            {
+                let message = format!(
+                    "{name} is {least}, below the threshold of the model of node '{}', {own:.4}: the model's bound on drops {doubt}",
+                    classifier.node
+                );
+                let help = "expected 0, which takes the model's own threshold".into();
+                self.fit.warnings.push(Misfit { kind: MisfitKind::Bound, node: arbiter.node.clone(), message, help });
+                return;
+            }
         }
         let is_weaker = best.is_some_and(|best| own.is_none_or(|own| own > best));
         let is_unbacked = promised.is_some_and(|promised| promised < own.unwrap_or(1.0));
@@ -463,6 +467,10 @@ mod tests {
         parts[4].params.insert("min_probability_stable".into(), 0.3.into());
         let warnings = check_fit(&parts).warnings;
         assert!(warnings.len() == 1 && warnings[0].message.contains("is 0.3, below the threshold"), "{warnings:?}");
+        let mut parts = gate(HAND, LIFTS, "test_lift");
+        parts[4].params.insert("min_probability_promising".into(), 0.1.into());
+        let warnings = check_fit(&parts).warnings;
+        assert!(warnings.len() == 1 && warnings[0].message.contains("is not proven"), "{warnings:?}");
         // The graph of a live hand promises what its model does, in tenths of a percent.
         let model = Model::load(Path::new(&project(LIFTS))).expect("a model");
         let own = (1000.0 * most_drops(&model, "test_lifted").expect("a bound")).ceil() / 1000.0;

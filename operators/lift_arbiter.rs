@@ -54,7 +54,7 @@ pub(crate) fn describe() -> OperatorDescription {
             "min_probability_promising",
             share.clone(),
             Some(default.min_probability_promising.into()),
-            "The least probability with which a grasp is probed, in place of the model's own thresholds; 0 keeps the model's",
+            "The least probability with which a grasp is probed, in place of the model's; 0 keeps those. Below, its bound is not proven",
         )
         .live_param(
             "max_gap_ms",

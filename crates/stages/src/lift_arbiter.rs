@@ -664,7 +664,7 @@ impl LiftArbiter {
     }
 
     /// The limit that a grasp has exceeded, or the frames that did not come, for people.
-    fn grounds(&self, open: &OpenGrasp, reason: Reason) -> Vec<String> {
+    fn grounds(&mut self, open: &OpenGrasp, reason: Reason) -> Vec<String> {
         let mut said = Vec::new();
         if let (Reason::Stale | Reason::NoAgreement, Some(stale)) = (reason, open.stale) {
             said.push(stale.to_string());
@@ -681,7 +681,9 @@ impl LiftArbiter {
             }
             Reason::Missing => said.push("no frame of phase settled came before its end".into()),
             Reason::OutOfOrder => {
-                let Some((seq, last_seq, nanos)) = self.broken else { return said };
+                let Some((seq, last_seq, nanos)) = self.broken.take() else {
+                    return vec!["its first frames are missing, or a late frame of another grasp came amid it".into()];
+                };
                 let (millis, order) = (nanos.abs() as f64 / 1e6, if nanos < 0 { "earlier" } else { "later" });
                 said.push(format!("frame {seq} came after frame {last_seq}, by its time {millis:.1} ms {order}"));
             }

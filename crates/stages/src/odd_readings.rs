@@ -94,6 +94,8 @@ impl OddReadings {
         }
         if self.n_frames < MAX_FRAMES {
             self.count_changes(hand.noise_thresholds_newtons(), cells_newtons);
+        } else {
+            self.cells_newtons.copy_from_slice(cells_newtons);
         }
         let was_at_rest = std::mem::replace(&mut self.is_at_rest, phase == Phase::Settled);
         if !self.is_at_rest {

@@ -99,10 +99,6 @@ impl Violation {
             |it: &&Violation| it.limits.quantity.ends_with(", newtons") && it.value > UNIT_FACTOR * it.limits.upper;
         if worst.first().is_some_and(is_other_unit) {
             said.push("are the readings in another unit, as counts or grams?".into());
-        } else if worst.iter().any(|it| it.limits.quantity.starts_with("contacts of pad ")) {
-            said.push(
-                "so many cells feel at once if they have wrong zeros or noise, or pass loads on (crosstalk)".into(),
-            );
         }
         said
     }

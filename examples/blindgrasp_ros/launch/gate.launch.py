@@ -22,6 +22,7 @@ ARGUMENTS = {
 
 def actions(context):
     given = {name: context.launch_configurations[name] for name in ARGUMENTS}
+    given["namespace"] = given["namespace"].rstrip("/") or "/blindgrasp"
 
     def node(executable, *arguments):
         arguments = list(arguments)

@@ -58,7 +58,7 @@ pub(super) struct Arguments {
     #[arg(long, default_value = "none", value_parser = |text: &str| word::<Probe>(text, "none, squeeze or test_lift"), conflicts_with = "split")]
     probe: Probe,
     /// Probe grasps from this probability on, as lift_arbiter.min_probability_promising says to a graph.
-    #[arg(long, value_name = "PROBABILITY", conflicts_with = "split")]
+    #[arg(long, value_name = "PROBABILITY", value_parser = |text: &str| number_in(text, 0.0..=1.0), conflicts_with = "split")]
     min_promising: Option<f64>,
     /// Train recipes on a part of the grasps and judge the rest, by folds that share no grasp, object or class.
     #[arg(long, value_parser = ["grasp", "object", "class"])]
@@ -129,8 +129,8 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let mut model = model.map(|path| Ok::<_, anyhow::Error>((path, Model::load(path)?))).transpose()?;
     if let Some((path, model)) = &mut model {
         check_probe(path, model, arguments.probe)?;
-        if let Some(least) = arguments.min_promising {
-            probe_from(model, least);
+        if let Some(least) = arguments.min_promising.filter(|least| *least > 0.0) {
+            probe_from(path, model, least)?;
         }
     }
     let recordings = recordings_in(recordings)?;
@@ -164,11 +164,13 @@ impl Arguments {
 }
 
 /// Lets the model call a grasp promising from this probability on.
-fn probe_from(model: &mut Model, least: f64) {
+fn probe_from(path: &Path, model: &mut Model, least: f64) -> anyhow::Result<()> {
+    let Some(squeezed) = &mut model.squeezed else {
+        bail!("--min-promising: {} knows no probe: give a model that was trained on lifts", path.display());
+    };
     model.classifier.unsure_from_probability = least;
-    if let Some(squeezed) = &mut model.squeezed {
-        squeezed.classifier.unsure_from_probability = least;
-    }
+    squeezed.classifier.unsure_from_probability = least;
+    Ok(())
 }
 
 /// Refuses a probe after which the model judges nothing: every grasp would be held.
@@ -197,7 +199,9 @@ struct Job<'a> {
 
 impl Job<'_> {
     fn model(self, path: &Path, model: &Model) -> anyhow::Result<Outcome> {
-        let options = ArbiterOptions { probe: self.arguments.probe, ..ArbiterOptions::default() };
+        let Arguments { probe, min_promising, .. } = *self.arguments;
+        let min_probability_promising = min_promising.unwrap_or(0.0);
+        let options = ArbiterOptions { probe, min_probability_promising, ..ArbiterOptions::default() };
         let evaluated = evaluate(self.hand, model, self.recordings, &options)?;
         let is_table = !self.arguments.json;
         if is_table {

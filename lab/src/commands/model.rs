@@ -103,14 +103,15 @@ fn adapt_model(arguments: &AdaptArguments) -> anyhow::Result<Outcome> {
     Ok(Outcome::Done)
 }
 
-/// The name of the robot of a recording: that of the file, without the number of a part, or of the folder that was named.
+/// The name of the robot of a recording: the path of the file, without the number of a part, or the folder that was named.
 fn robot_of(recording: &Path, named: &[PathBuf]) -> String {
     if !named.iter().any(|path| path == recording)
         && let Some(folder) = recording.parent().and_then(Path::file_name)
     {
         return folder.to_string_lossy().into_owned();
     }
-    let stem = recording.file_stem().unwrap_or_default().to_string_lossy();
+    let stem = recording.with_extension("");
+    let stem = stem.to_string_lossy();
     match stem.rsplit_once('-') {
         Some((name, number)) if number.len() == 5 && number.bytes().all(|byte| byte.is_ascii_digit()) => name.into(),
         _ => stem.into_owned(),
@@ -417,7 +418,7 @@ mod tests {
     fn a_robot_is_named_by_its_file_or_folder() {
         let named = ["days/robot-a.mcap", "robot-b-00001.mcap", "robots/c/"].map(PathBuf::from);
         let robot = |path: &str| robot_of(Path::new(path), &named);
-        assert_eq!(robot("days/robot-a.mcap"), "robot-a");
+        assert_eq!(robot("days/robot-a.mcap"), "days/robot-a");
         assert_eq!(robot("robot-b-00001.mcap"), "robot-b");
         assert_eq!(robot("robots/c/2026-11-29.mcap"), "c");
     }
