@@ -227,18 +227,9 @@ impl<'a> Check<'a> {
         });
     }
 
-    /// A live hand with a promise that the model does not back, or without the test lift for which it promises fewer drops.
-    fn bound(&mut self, arbiter: &Part, classifier: &Part, model: &Model) {
-        let name = arbiter.params.get("probe").and_then(Value::as_str).unwrap_or("none");
-        let best = if name == "test_lift" { None } else { most_drops(model, "test_lifted") };
-        let look = match name {
-            "squeeze" => Phase::Squeezed,
-            "test_lift" => Phase::TestLifted,
-            _ => Phase::Settled,
-        };
-        let own = most_drops(model, look.as_str());
+    /// A threshold of the arbiter below the model's own.
+    fn is_loosened(&mut self, arbiter: &Part, classifier: &Part, model: &Model, look: Phase) -> bool {
         let number = |name: &str| arbiter.params.get(name).and_then(Value::as_f64);
-        let promised = number("promised_drops");
         let promising = if look == Phase::Settled { None } else { Some(model.classifier.unsure_from_probability) };
         for (name, own, doubt) in [
             ("min_probability_stable", model.look(look).map(|of_look| of_look.threshold_probability), "does not hold"),
@@ -254,8 +245,26 @@ impl<'a> Check<'a> {
                 );
                 let help = "expected 0, which takes the model's own threshold".into();
                 self.fit.warnings.push(Misfit { kind: MisfitKind::Bound, node: arbiter.node.clone(), message, help });
-                return;
+                return true;
             }
+        }
+        false
+    }
+
+    /// A live hand with a promise that the model does not back, or without the test lift for which it promises fewer drops.
+    fn bound(&mut self, arbiter: &Part, classifier: &Part, model: &Model) {
+        let name = arbiter.params.get("probe").and_then(Value::as_str).unwrap_or("none");
+        let best = if name == "test_lift" { None } else { most_drops(model, "test_lifted") };
+        let look = match name {
+            "squeeze" => Phase::Squeezed,
+            "test_lift" => Phase::TestLifted,
+            _ => Phase::Settled,
+        };
+        let own = most_drops(model, look.as_str());
+        let number = |name: &str| arbiter.params.get(name).and_then(Value::as_f64);
+        let promised = number("promised_drops");
+        if self.is_loosened(arbiter, classifier, model, look) {
+            return;
         }
         let is_weaker = best.is_some_and(|best| own.is_none_or(|own| own > best));
         let is_unbacked = promised.is_some_and(|promised| promised < own.unwrap_or(1.0));
