@@ -93,8 +93,8 @@ struct Next<'a> {
     written: Option<Written>,
     /// The number of the first sample of this publisher in the epoch.
     own_first: u64,
-    /// Whether samples of earlier publishers can be sent again.
-    is_repeatable: bool,
+    /// See [`Credit::begun_after`].
+    begun_after: Option<Option<SampleId>>,
     /// See [`Credit::newest`].
     newest: &'a VecDeque<SampleId>,
     /// See [`Credit::lost`].
@@ -180,10 +180,15 @@ impl Reader {
         }
         // It had answered the epoch before, or it has just come.
         let first_unanswered = is_within_epoch.map_or(written.first_seq, |key| key.seq + 1);
-        let first_unanswered = match self.limit {
-            Limit::History(_) if next.is_repeatable => first_unanswered,
-            Limit::Queue(_) | Limit::History(_) => first_unanswered.max(next.own_first),
+        // Others still have the samples up to `begun_after` for it. Behind that, this publisher sends all that there are again:
+        // no sample has the numbers before its first one.
+        let needs_others = match (self.limit, next.begun_after) {
+            (Limit::History(_), Some(Some(begun_after))) => {
+                !self.key.is_some_and(|key| written.is_past(key, begun_after))
+            }
+            _ => false,
         };
+        let first_unanswered = if needs_others { first_unanswered } else { first_unanswered.max(next.own_first) };
         next.key.seq.saturating_sub(first_unanswered) < limit
     }
 
@@ -250,8 +255,8 @@ impl Credit {
         let is_repeat = self.is_repeat(key);
         let last = if is_repeat { self.own_last } else { None };
         let key = last.map_or(key, |last| SampleId { seq: last.seq + 1, ..last });
-        let (is_repeatable, newest, lost) = (self.begun_after.is_some(), &self.newest, self.lost);
-        let next = Next { key, is_repeat, written, own_first, is_repeatable, newest, lost };
+        let (begun_after, newest, lost) = (self.begun_after, &self.newest, self.lost);
+        let next = Next { key, is_repeat, written, own_first, begun_after, newest, lost };
         self.readers.iter_mut().find_map(|reader| (!reader.has_room(places, &next, None)).then_some(&*reader))
     }
 
@@ -536,6 +541,21 @@ mod tests {
         credit.begin(true, &places, Some(written));
         credit.has_waited_long(&places, Some(written), 1);
         assert!(credit.first_without_room(&places, Some(written), id(9, 0)).is_some());
+    }
+
+    /// The numbers jump by more than the history, or a source that cannot give its samples again goes on after those that it
+    /// has lost; then the writer and its reader die.
+    #[test]
+    fn numbers_that_no_sample_has_hold_up_no_instance_that_begins_again() {
+        let ids = [9, 10, 11, 12, 13].map(|seq| id(7, seq));
+        let places = Chain([Some(id(7, 0)); 2], Some(id(7, 0)));
+        for (is_handed_over, n_with_room) in [(false, 4), (true, 0)] {
+            let mut written = Some(Written { last: id(7, 9), first_seq: 0, before: None });
+            let mut credit = credit_of_chain();
+            credit.begin(is_handed_over, &places, written);
+            let keys = if is_handed_over { &ids[1..] } else { &ids[..] };
+            assert_eq!(n_sent(&mut credit, &mut written, keys, &places), n_with_room);
+        }
     }
 
     /// L8: it was handed over to, or has begun again and has not sent again what its predecessor had sent.

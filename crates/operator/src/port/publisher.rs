@@ -22,8 +22,10 @@ use crate::wiring::{OutputWiring, ServiceWiring};
 use crate::written::Written;
 use blindgrasp_messages::{Header, Message};
 
-/// A waiting publisher yields so often before it sleeps between tries.
+/// A waiting publisher yields so often before it sleeps between tries, and gives heartbeats.
 const N_YIELDS: u32 = 64;
+/// On a busy machine it yields no longer: each time may last as long as others want to run.
+const YIELD_LIMIT: Duration = Duration::from_millis(5);
 /// A waiting publisher then sleeps so long between tries.
 const RETRY_PAUSE: Duration = Duration::from_micros(50);
 /// A waiting publisher looks so often for readers that have come back.
@@ -454,7 +456,7 @@ impl UntypedPublisher {
                 Wait::On => {}
             }
             n_tries += 1;
-            if n_tries < N_YIELDS {
+            if n_tries < N_YIELDS && start.elapsed() < YIELD_LIMIT {
                 std::thread::yield_now();
                 continue;
             }
