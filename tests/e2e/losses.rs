@@ -385,7 +385,7 @@ fn a_run_with_few_descriptors_loses_nothing_or_is_refused_in_words() {
     let folder = tempfile::tempdir().expect("a folder");
     let flow = dataflow_with(folder.path(), &[]);
     let (mut n_whole, mut n_refused) = (0, 0);
-    for n_files in (16..=72).step_by(14) {
+    for n_files in (16..=100).step_by(21) {
         let mut limited = Command::new("sh");
         let exec = format!("ulimit -n {n_files} && exec \"$0\" \"$@\"");
         limited.args(["-c", &exec, program()]).current_dir(project());
