@@ -454,7 +454,7 @@ mod tests {
         // Two recordings of one robot with 20 lifts each, and one of another, which drops five of 20 and would not make the last.
         let example = |idx: usize| Example {
             recording_idx: idx / 20,
-            stable: idx < 40 || idx % 4 != 0,
+            stable: idx < 40 || !idx.is_multiple_of(4),
             object: idx.to_string(),
             ..Example::default()
         };
