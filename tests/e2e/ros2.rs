@@ -111,7 +111,7 @@ for grasp_id in itertools.count():
 ";
 /// MoveIt's part: goals, one after the other, and how each ended.
 const GOALS: &str = "
-import sys, rclpy
+import sys, time, rclpy
 from rclpy.action import ActionClient
 from control_msgs.action import GripperCommand
 rclpy.init()
@@ -124,7 +124,10 @@ def result(future):
 for position in map(float, sys.argv[1:]):
     goal = GripperCommand.Goal()
     goal.command.position = position
-    ended = result(result(client.send_goal_async(goal)).get_result_async())
+    # At first the gate does not know who publishes decisions.
+    while not (handle := result(client.send_goal_async(goal))).accepted:
+        time.sleep(0.1)
+    ended = result(handle.get_result_async())
     print(position, ended.status, flush=True)
 ";
 
