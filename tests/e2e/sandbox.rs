@@ -102,7 +102,10 @@ ssize_t write(int fd, const void *bytes, size_t n) {
     cpu_set_t cpus;
     CPU_SET(0, &cpus);
     pid_t launcher = getppid();
-    int own = make("ports/own");
+    /* The operators of the graph share the folder. */
+    char own_name[32];
+    snprintf(own_name, sizeof own_name, "ports/own%d", getpid());
+    int own = make(own_name);
     try("own file", own);
     fstat(own, &found);
     try("file with rights for others", found.st_mode & 077 ? 0 : (errno = EACCES, -1));
@@ -116,9 +119,9 @@ ssize_t write(int fd, const void *bytes, size_t n) {
     try("link", symlink("/etc/passwd", in("ports/link")));
     try("hard link", link(in("cursors"), in("ports/hard")));
     try("pipe", mkfifo(in("ports/pipe"), 0600));
-    try("move out", rename(in("ports/own"), "/dev/shm/blindgrasp_own"));
-    try("move to the link", rename(in("ports/own"), in("link/own")));
-    try("replace the slots", rename(in("ports/own"), in("cursors")));
+    try("move out", rename(in(own_name), "/dev/shm/blindgrasp_own"));
+    try("move to the link", rename(in(own_name), in("link/own")));
+    try("replace the slots", rename(in(own_name), in("cursors")));
     try("truncate the slots", truncate(in("cursors"), 0));
     try("umask", syscall(SYS_umask, 0));
     try("fchmod 4700", fchmod(own, 04700));
@@ -156,7 +159,7 @@ ssize_t write(int fd, const void *bytes, size_t n) {
     try("socket CAN", socket(AF_CAN, SOCK_RAW, 0));
     try("socket VSOCK", socket(AF_VSOCK, SOCK_STREAM, 0));
     rmdir(in("ports/folder"));
-    unlink(in("ports/own"));
+    unlink(in(own_name));
     try("last", 0);
     errno = error;
     return outcome;
