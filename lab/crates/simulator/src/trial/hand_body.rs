@@ -656,27 +656,6 @@ mod tests {
     }
 
     #[test]
-    fn a_hand_tightens_in_equal_steps_and_holds_the_force_of_each() {
-        before_a_ball(0.05, 0.13, |world, body, options| {
-            close_until_stopped(world, body, options);
-            for n_left in [3.0, 2.0, 1.0] {
-                let before: Vec<f64> = body.drives.iter().map(|drive| part_of(1.0, world, drive)).collect();
-                body.tighten(world, 1.0 / n_left, options);
-                for _ in 0..200 {
-                    body.hold_force(world, options);
-                    world.step();
-                }
-                let mut steps = body.drives.iter().zip(before).filter(|(drive, _)| !drive.has_broken_away);
-                let is_equal = |(drive, before): (&Drive, f64)| {
-                    let wanted = before + (options.lift_grip_newtons - before) / n_left;
-                    (part_of(1.0, world, drive) - wanted).abs() < 0.03 * wanted
-                };
-                assert!(steps.any(is_equal), "{n_left} steps left");
-            }
-        });
-    }
-
-    #[test]
     fn jaws_centre_a_ball_and_press_alike_from_both_sides() {
         let hand = Hand::load(Path::new("parallel-gripper")).expect("built in");
         // 15 mm nearer to the left jaw, which pushes it to the right one.
