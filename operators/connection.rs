@@ -120,7 +120,7 @@ mod tests {
     }
 
     #[test]
-    fn by_default_the_names_of_ros_2_take_part_and_where_it_connects_the_routers() {
+    fn by_default_the_name_zenoh_takes_part_and_where_it_connects_the_routers() {
         let names = |yaml| params(&yaml).map(|network| network.names);
         let of = |names: &[&str]| Ok(names.iter().map(|name| (*name).to_owned()).collect());
         assert_eq!(names(json!({"keys": "/k", "listen": "tls/0.0.0.0:1"})), of(&["zenoh"]));

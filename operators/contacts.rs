@@ -83,11 +83,11 @@ struct FindContacts {
     odd: GraspLog,
 }
 
-/// Says of grasps what is wrong with their frames without filling the log: each sentence once, and those of one grasp in a second.
-/// The next line says how many others had some.
+/// Tells the faults of grasps without filling the log: each sentence of a grasp once, and those of one grasp in a second. The next
+/// line has the number of the grasps that were left out.
 #[derive(Default)]
 struct GraspLog {
-    /// The last grasp with something wrong, whether it is one that is told, and its sentences that have been, without their numbers.
+    /// The last grasp with a fault, whether its sentences are told, and those that have been, without their numbers.
     grasp: Option<u64>,
     is_told: bool,
     told: BTreeSet<String>,

@@ -227,7 +227,7 @@ impl<'a> Check<'a> {
         });
     }
 
-    /// A threshold of the arbiter below the model's own.
+    /// Warns of a threshold of the arbiter below the model's own, if there is one.
     fn is_loosened(&mut self, arbiter: &Part, classifier: &Part, model: &Model, look: Phase) -> bool {
         let number = |name: &str| arbiter.params.get(name).and_then(Value::as_f64);
         let promising = if look == Phase::Settled { None } else { Some(model.classifier.unsure_from_probability) };

@@ -25,7 +25,7 @@ pub enum UpdateError {
 
 /// Writes the recording anew and says what it wrote. The edges of the replay take the place of the recorded ones; the
 /// played topic, labels, scenes, metadata, attachments, and the edges of stages that did not run stay. Topics for viewers are
-/// written anew for the recording's hand, if it is attached: then they are ours.
+/// made again if the files of the recording's hand are attached: then this library has written them.
 ///
 /// # Errors
 /// See [`UpdateError`].
@@ -143,7 +143,7 @@ mod tests {
         }
     }
 
-    /// A recording of a graph, written anew without another sample.
+    /// Updates a recording by a replay without samples.
     fn updated(path: &Path, hand: Option<ShownHand>) -> Result<String, UpdateError> {
         let coverage = Coverage::of(path, "/tactile").expect("covered");
         update(path, path, "/tactile", &[], &coverage, hand)

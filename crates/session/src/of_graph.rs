@@ -71,8 +71,8 @@ fn label(graph: &Value) -> Option<Label> {
     })
 }
 
-/// The models of a graph's nodes: where they lie and which they are, and the files of our own, each once. What is no model of ours
-/// has nothing but its path.
+/// The model of each node: its path, and its dictionary and checksum if this library can read it. The files that it can read come
+/// beside, each once.
 fn models(graph: &Value) -> (Value, BTreeMap<String, Vec<u8>>) {
     let (mut models, mut files) = (Map::new(), BTreeMap::new());
     for (node, path) in param(graph, "model") {

@@ -421,7 +421,7 @@ impl LiftArbiter {
         if self.state.options.promised_drops != options.promised_drops {
             self.state.promise = PromiseMonitor::default();
         }
-        // Outcomes under another rule of what is lifted say nothing for this one.
+        // A bound is of lifts by one rule.
         let rule = |of: &ArbiterOptions| {
             (of.lifts_per_object, of.min_probability_stable, of.min_probability_promising, of.votes, of.probe)
         };
@@ -682,7 +682,7 @@ impl LiftArbiter {
             Reason::Missing => said.push("no frame of phase settled came before its end".into()),
             Reason::OutOfOrder => {
                 let Some((seq, last_seq, nanos)) = self.broken.take() else {
-                    return vec!["its first frames are missing, or a late frame of another grasp came amid it".into()];
+                    return vec!["the first frames of the grasp are missing, or a late frame of another grasp came between its own".into()];
                 };
                 let (millis, order) = (nanos.abs() as f64 / 1e6, if nanos < 0 { "earlier" } else { "later" });
                 said.push(format!("frame {seq} came after frame {last_seq}, by its time {millis:.1} ms {order}"));

@@ -29,7 +29,7 @@ const NOISE_STEPS: f64 = 4.0;
 /// Grasps in a row in which a value is the same number: a finger may be blocked from the start in one or two of them.
 const SAME_GRASPS: u32 = 5;
 
-/// The readings of a grasp's frames so far, and what was the same in the grasps before it.
+/// The readings of a grasp's frames so far, and the values that stayed the same in the grasps before it.
 #[derive(Debug, Default)]
 pub struct OddReadings {
     /// Epoch and grasp of the last frame.
@@ -49,7 +49,7 @@ pub struct OddReadings {
     rest_newtons: [f64; MAX_PADS],
     /// For each pad: in how many frames in a row its load has been another one.
     n_changed: [u32; MAX_PADS],
-    /// What has moved although the hand was said to be at rest.
+    /// The sentence about a joint or a load that has moved in the settled hand.
     unrest: Option<String>,
     /// The greatest force of a contact of the settled hand.
     greatest_newtons: f64,

@@ -673,6 +673,27 @@ mod tests {
         });
     }
 
+    #[test]
+    fn jaws_tighten_in_equal_steps_and_hold_the_force_of_each() {
+        let hand = Hand::load(Path::new("parallel-gripper")).expect("built in");
+        with_a_ball(&hand, 0.02, [0.0, 0.0, 0.04], 0.2, |world, body, options| {
+            close_until_stopped(world, body, options);
+            for n_left in [3.0, 2.0, 1.0] {
+                let before: Vec<f64> = body.drives.iter().map(|drive| part_of(1.0, world, drive)).collect();
+                body.tighten(world, 1.0 / n_left, options);
+                for _ in 0..200 {
+                    body.hold_force(world, options);
+                    world.step();
+                }
+                for (drive, before) in body.drives.iter().zip(before) {
+                    let wanted = before + (options.lift_grip_newtons - before) / n_left;
+                    let found = part_of(1.0, world, drive);
+                    assert!((found - wanted).abs() < 0.05 * wanted, "{n_left} steps left: {before}, {found}, {wanted}");
+                }
+            }
+        });
+    }
+
     /// Two fingers of a parallel linkage, as of the 2F-85: their tips keep their direction while the knuckles turn.
     const LINKAGE: &str = r#"<robot name="linkage">
 <link name="palm"><collision><origin xyz="0 0 -0.03"/><geometry><box size="0.06 0.07 0.06"/></geometry></collision></link>
