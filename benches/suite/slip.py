@@ -64,7 +64,7 @@ def train(sequences, hand, folder, later_alone):
     columns += ["--grasp-column", "grasp", "--phase-column", "phase", "--joints", "palm_pitch=0"]
     programs.blindgrasp("import", table, "--hand", hand, *columns, "--overwrite", "--out", recording)
     # The cost of a drop chooses thresholds, which do not matter here: the areas do not depend on them.
-    words = ["--words", 8, "--drop-secs", 120, "--overwrite", "--out", model]
+    words = ["--words", 8, "--drop-costs", 40, "--overwrite", "--out", model]
     programs.blindgrasp("train", recording, "--hand", hand, *words)
     return json.loads(model.read_text())["training"]
 

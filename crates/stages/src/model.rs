@@ -409,7 +409,7 @@ impl Model {
         }
         match (phase, verdict) {
             (Phase::Kept | Phase::Dropped, _) if memory.adapt != Adapt::Frozen && values != Err(Fault::WrongHand) => {
-                let classifier = |look: Phase| Some((self.look(look)?, self.drop_secs(look)));
+                let classifier = |look: Phase| Some((self.look(look)?, self.drop_costs(look)));
                 let is_kept = phase == Phase::Kept;
                 if memory.lifts.lifted(place.grasp_id, is_kept, memory.adapt == Adapt::On, classifier) {
                     return Err(Fault::Changed);
@@ -468,8 +468,8 @@ impl Model {
     }
 
     /// The price of a drop that the threshold of a look was chosen for, seconds.
-    pub fn drop_secs(&self, look: Phase) -> Option<f64> {
-        self.training.policies.iter().find(|policy| policy.look == look.as_str()).map(|policy| policy.drop_secs)
+    pub fn drop_costs(&self, look: Phase) -> Option<f64> {
+        self.training.policies.iter().find(|policy| policy.look == look.as_str()).map(|policy| policy.drop_costs)
     }
 
     /// The classifier of a look at a grasp that a lift can follow; `None` for the frames between looks. A grasp that is judged by

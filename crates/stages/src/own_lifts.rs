@@ -130,28 +130,25 @@ pub fn log_loss(log_odds: f64, stable: bool) -> f64 {
     libm::log1p(libm::exp(-z.abs())) + (-z).max(0.0)
 }
 
-/// Time of an attempt until the hand has settled, of tightening it, of a test lift, and of a lift, seconds: as the simulated
-/// hand takes.
-pub const ATTEMPT_SECS: f64 = 3.0;
-pub const SQUEEZE_SECS: f64 = 0.4;
-pub const TEST_LIFT_SECS: f64 = 0.8;
-pub const LIFT_SECS: f64 = 4.0;
+/// The costs of tightening the hand and of a test lift, in attempts. They take 0.4 and 0.8 s, where an arm opens its hand, goes
+/// back and grasps again in some ten.
+pub const SQUEEZE_COSTS: f64 = 0.04;
+pub const TEST_LIFT_COSTS: f64 = 0.08;
 /// Fewer lifts than this say nothing of the share that is kept.
 const FEWEST_LIFTS: usize = 5;
 /// The part by which another threshold must cost less than the present one.
 const WORTH_A_CHANGE: f64 = 0.02;
 
-/// Time for each kept object, seconds, if a drop takes `drop_secs` more: `lifted` is the share of the grasps that are lifted, and `kept`
-/// the share of the lifts that keep their object. Each grasp counts with its probes.
-pub fn secs_per_kept(lifted: f64, kept: f64, drop_secs: f64) -> f64 {
-    let attempt_secs = ATTEMPT_SECS + SQUEEZE_SECS + TEST_LIFT_SECS;
-    (attempt_secs / lifted + LIFT_SECS + drop_secs * (1.0 - kept)) / kept
+/// Attempts for each kept object, if a drop costs as much as `drop_costs` attempts. `kept` is the share of the lifts that keep their
+/// object.
+pub fn attempts_per_kept(attempts_per_lift: f64, kept: f64, drop_costs: f64) -> f64 {
+    (attempts_per_lift + drop_costs * (1.0 - kept)) / kept
 }
 
 /// The log-odds from which a grasp is lifted at the least cost. `log_odds` are those of grasps with an outcome, out of
 /// `n_grasps`; their probabilities say how many are kept. It is `present` unless a higher one costs clearly less: outcomes of a few
 /// grasps are no reason to lift what was held before.
-pub fn threshold(log_odds: &[f64], n_grasps: u64, present: f64, drop_secs: f64) -> f64 {
+pub fn threshold(log_odds: &[f64], n_grasps: u64, present: f64, drop_costs: f64) -> f64 {
     let mut lifted: Vec<f64> = log_odds.iter().copied().filter(|log_odds| *log_odds >= present).collect();
     lifted.sort_by(|a, b| b.total_cmp(a));
     let n_grasps = (n_grasps as f64).max(lifted.len() as f64);
@@ -160,7 +157,7 @@ pub fn threshold(log_odds: &[f64], n_grasps: u64, present: f64, drop_secs: f64) 
     for (idx, log_odds) in lifted.iter().enumerate() {
         kept += probability(*log_odds);
         let n = (idx + 1) as f64;
-        costs.push((secs_per_kept(n / n_grasps, kept / n, drop_secs), *log_odds));
+        costs.push((attempts_per_kept(n_grasps / n, kept / n, drop_costs), *log_odds));
     }
     let cost_of_present = costs.last().map_or(0.0, |(cost, _)| *cost);
     let least = costs.into_iter().skip(FEWEST_LIFTS - 1).min_by(|a, b| a.0.total_cmp(&b.0));
@@ -183,15 +180,15 @@ impl Learned {
         prior: Prior,
         outcomes: impl Iterator<Item = (f64, bool)> + Clone,
         n_grasps: u64,
-        drop_secs: Option<f64>,
+        drop_costs: Option<f64>,
     ) -> Learned {
         let correction = Correction::fit(prior, outcomes.clone());
         let before = classifier.threshold_probability;
-        let threshold_probability = match drop_secs {
-            Some(drop_secs) if before < 1.0 => {
+        let threshold_probability = match drop_costs {
+            Some(drop_costs) if before < 1.0 => {
                 let log_odds: Vec<f64> = outcomes.map(|(log_odds, _)| correction.apply(log_odds)).collect();
                 let present = correction.apply(log_odds_of(before));
-                let chosen = threshold(&log_odds, n_grasps, present, drop_secs);
+                let chosen = threshold(&log_odds, n_grasps, present, drop_costs);
                 probability(chosen)
             }
             _ => before,
@@ -331,11 +328,11 @@ impl OwnLifts {
         self.outcomes.push_back(Outcome { look, log_odds: log_odds as f32, is_kept, n_grasps });
         let of_look = || self.outcomes.iter().filter(|outcome| outcome.look == look);
         if of_look().count() >= FEWEST_OUTCOMES
-            && let Some((classifier, drop_secs)) = classifier(look)
+            && let Some((classifier, drop_costs)) = classifier(look)
         {
             let n_grasps = self.outcomes.iter().map(|outcome| u64::from(outcome.n_grasps)).sum();
             let outcomes = of_look().map(|outcome| (f64::from(outcome.log_odds), outcome.is_kept));
-            let learned = Learned::of(classifier, OF_A_ROBOT, outcomes, n_grasps, drop_secs);
+            let learned = Learned::of(classifier, OF_A_ROBOT, outcomes, n_grasps, drop_costs);
             self.learned.retain(|(known, _)| *known != look);
             self.learned.push((look, learned));
         }
@@ -432,7 +429,7 @@ mod tests {
         // Of 100 grasps, 20 are kept with a probability of 0.99 and 20 with 0.6.
         let log_odds = |probability: f64| libm::log(probability / (1.0_f64 - probability));
         let grasps: Vec<f64> = (0..40).map(|idx| log_odds(if idx < 20 { 0.99 } else { 0.6 })).collect();
-        let choose = |present, drop_secs| threshold(&grasps, 100, present, drop_secs);
+        let choose = |present, drop_costs| threshold(&grasps, 100, present, drop_costs);
         assert_eq!(choose(0.0, 300.0), log_odds(0.99));
         assert_eq!(choose(0.0, 0.0), 0.0, "a drop costs nothing: it stays");
         assert_eq!(choose(log_odds(0.9), 0.0), log_odds(0.9), "it never falls");

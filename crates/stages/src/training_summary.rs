@@ -7,7 +7,7 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer, de::Error as _};
 use sha2::{Digest, Sha256};
 
 use crate::label::Label;
-use crate::own_lifts::Correction;
+use crate::own_lifts::{Correction, attempts_per_kept};
 use crate::recipe::Recipe;
 
 /// How a model was trained.
@@ -160,17 +160,14 @@ impl<'de> Deserialize<'de> for ReadingId {
 pub struct PolicySummary {
     /// The phase after which the grasp is decided.
     pub look: String,
-    /// The time that a drop costs, seconds, for which the thresholds were chosen.
-    pub drop_secs: f64,
+    /// The price of a drop, in attempts, for which the thresholds were chosen.
+    pub drop_costs: f64,
     /// Area under the ROC curve of the probabilities out of folds.
     pub roc_area: f64,
     pub kept: f64,
     pub attempts_per_lift: f64,
     /// Share of the trials without a lift.
     pub given_up: f64,
-    /// Time for each kept object, seconds, if an attempt takes 3 s, a probe 1.2 s and a lift 4 s. The cost of drops is left
-    /// out.
-    pub secs_per_kept: f64,
     /// The bounds of drops for new objects. `None` in models of earlier versions, and for a look whose thresholds are not the
     /// model's.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -200,7 +197,7 @@ pub struct ThresholdPoint {
 impl ThresholdPoint {
     /// Attempts for each kept object, if a drop costs as much as `drop_costs` attempts.
     pub fn attempts_per_kept(&self, drop_costs: f64) -> f64 {
-        (self.attempts_per_lift + drop_costs * (1.0 - self.kept)) / self.kept
+        attempts_per_kept(self.attempts_per_lift, self.kept, drop_costs)
     }
 }
 

@@ -58,15 +58,15 @@ pub(super) struct Arguments {
     /// The SVM's kernel width.
     #[arg(long, value_parser = |text: &str| number_in(text, 1e-9..=1e9))]
     gamma: Option<f64>,
-    /// Choose the thresholds by the price of a drop. They are those that take the least time for each kept object, if a drop
-    /// costs so many seconds and the hand grasps again until it lifts, judged by folds of objects. Recordings with probes get a
-    /// threshold for each probe. 120 is cautious, the models of lifts that come with blindgrasp were trained with 300, and 0 is
-    /// for objects that may fall.
-    #[arg(long, value_name = "SECONDS", value_parser = |text: &str| number_in(text, 0.0..=1e6))]
-    drop_secs: Option<f64>,
+    /// Choose the thresholds by the price of a drop. They are those with the fewest attempts for each kept object, if a drop
+    /// costs as much as so many attempts and the hand grasps again until it lifts, judged by folds of objects. Recordings with
+    /// probes get a threshold for each probe. 40 is cautious, the models of lifts that come with blindgrasp were trained with
+    /// 100, and 0 is for objects that may fall.
+    #[arg(long, value_name = "ATTEMPTS", value_parser = |text: &str| number_in(text, 0.0..=1e6))]
+    drop_costs: Option<f64>,
     /// Choose the thresholds by a bound on drops: at most this share of the lifts drops, with 95 % confidence, for new objects
     /// like those recorded. A stage whose strictest threshold cannot promise this never lifts.
-    #[arg(long, value_name = "SHARE", conflicts_with = "drop_secs", value_parser = |text: &str| number_in(text, 1e-4..=0.9999))]
+    #[arg(long, value_name = "SHARE", conflicts_with = "drop_costs", value_parser = |text: &str| number_in(text, 1e-4..=0.9999))]
     max_drops: Option<f64>,
     /// The seed of K-means and boosting.
     #[arg(long, default_value_t = TrainingOptions::default().seed)]
@@ -87,7 +87,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     }
     let options = TrainingOptions {
         recipe: recipe(arguments)?,
-        aim: arguments.drop_secs.map(Aim::DropSecs).or(arguments.max_drops.map(Aim::MaxDrops)),
+        aim: arguments.drop_costs.map(Aim::DropCosts).or(arguments.max_drops.map(Aim::MaxDrops)),
         seed: arguments.seed,
     };
     let progress = |what: &str| print_diagnostic(&format!("{what} …"));
@@ -134,22 +134,17 @@ pub(super) fn probe_lines(model: &Model) -> Vec<String> {
     );
     // A promise holds for the world that the lifts were made in.
     let world = if model.training.labels.is_empty() { "as recorded" } else { "in simulation" };
-    let (kept, each_kept) = if is_of_the_papers_label(&model.training) {
-        ("stable by the paper's label", "each stable one")
-    } else {
-        ("kept", "each kept object")
-    };
+    let kept = if is_of_the_papers_label(&model.training) { "stable by the paper's label" } else { "kept" };
     for policy in &model.training.policies {
         lines.push(format!(
-            "expected of trials decided when {} (ROC area {:.3}; a drop costs {} s): {} of the lifted objects {kept}, {:.2} \
-             attempts with contact a lift, {} given up, {:.1} s for {each_kept}",
+            "expected of trials decided when {} (ROC area {:.3}; a drop costs {} attempts): {} of the lifted objects {kept}, {:.2} \
+             attempts with contact a lift, {} given up",
             policy.look.replace('_', "-"),
             policy.roc_area,
-            policy.drop_secs,
+            policy.drop_costs,
             percent(Some(policy.kept)),
             policy.attempts_per_lift,
-            percent(Some(policy.given_up)),
-            policy.secs_per_kept
+            percent(Some(policy.given_up))
         ));
         lines.extend(policy.promise.map(|promise| format!("promised for new objects {world}: {promise}")));
     }
@@ -163,7 +158,7 @@ pub(super) fn probe_lines(model: &Model) -> Vec<String> {
             None => format!("no cell feels {n_unfelt}, or only on links that touch each other"),
         };
         lines.push(format!(
-            "attempts without contact, and their time, are not counted: of the {} grasps, {kinds}; a robot holds such a grasp and \
+            "attempts without contact are not counted: of the {} grasps, {kinds}; a robot holds such a grasp and \
              tries again",
             n + model.training.n_grasps
         ));

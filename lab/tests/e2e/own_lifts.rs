@@ -66,7 +66,7 @@ fn the_outcomes_of_a_bridge_are_labels_and_correct_a_model() {
 
     // Outcomes are labels for training, evaluation and description.
     let model = at("model.json");
-    run(&["train", &known, "--hand", &hand, "--words", "2", "--drop-secs", "60", "--out", &model], 0);
+    run(&["train", &known, "--hand", &hand, "--words", "2", "--drop-costs", "20", "--out", &model], 0);
     for (recording, n_grasps, n_objects) in [(&own, 300, 60), (&nameless, 60, 60)] {
         let shown = json_of(&["info", recording, "--hand", &hand, "--json"]);
         assert_eq!(shown["n_with_truth"], n_grasps);

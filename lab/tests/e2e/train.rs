@@ -145,7 +145,7 @@ fn a_promise_about_drops_holds_for_new_objects_or_nothing_is_lifted() {
     let train = |more: &[&str], code: i32| {
         run(&[&["train", &known, "--hand", &hand, "--words", "2", "--overwrite", "--out", &model], more].concat(), code)
     };
-    for (flags, most) in [(["--drop-secs", "120"], 1.0), (["--max-drops", "0.25"], 0.25)] {
+    for (flags, most) in [(["--drop-costs", "40"], 1.0), (["--max-drops", "0.25"], 0.25)] {
         let trained = train(&flags, 0);
         let promised = "promised for new objects as recorded: at most";
         let printed = text(&trained.stdout);
@@ -169,8 +169,8 @@ fn a_promise_about_drops_holds_for_new_objects_or_nothing_is_lifted() {
         stderr.contains("the strictest threshold promises at most") && stderr.contains("or allow more drops"),
         "{stderr}"
     );
-    let twice = train(&["--max-drops", "0.1", "--drop-secs", "120"], 2);
-    assert!(text(&twice.stderr).contains("--drop-secs"), "{}", text(&twice.stderr));
+    let twice = train(&["--max-drops", "0.1", "--drop-costs", "40"], 2);
+    assert!(text(&twice.stderr).contains("--drop-costs"), "{}", text(&twice.stderr));
     let wrench_space = run(&["train", RECORDING, "--max-drops", "0.1", "--out", &at("never.json")], 1);
     let stderr = text(&wrench_space.stderr);
     assert!(stderr.contains("a share of drops can be promised for lifts alone"), "{stderr}");
@@ -181,7 +181,7 @@ fn what_to_expect_names_the_label_and_the_grasps_without_contact() {
     let folder = tempfile::tempdir().expect("a folder");
     let model = folder.path().join("model.json");
     let model = model.to_str().expect("UTF-8");
-    let trained = text(&run(&["train", RECORDING, "--drop-secs", "120", "--out", model], 0).stdout);
+    let trained = text(&run(&["train", RECORDING, "--drop-costs", "40", "--out", model], 0).stdout);
     let expected = [
         " of the lifted objects stable by the paper's label, ",
         " attempts with contact a lift, ",

@@ -24,8 +24,8 @@ use blindgrasp_stages::label::Label;
 use blindgrasp_stages::model::Model;
 use blindgrasp_stages::out_of_distribution::TrainingRange;
 use blindgrasp_stages::own_lifts::{
-    Correction, FEWEST_OUTCOMES, Learned, OF_A_ROBOT, OF_AN_UNLIKE_ROBOT, Prior, log_loss, log_odds_of, probability,
-    secs_per_kept,
+    Correction, FEWEST_OUTCOMES, Learned, OF_A_ROBOT, OF_AN_UNLIKE_ROBOT, Prior, attempts_per_kept, log_loss,
+    log_odds_of, probability,
 };
 use blindgrasp_stages::training_summary::{OwnLiftsSummary, Promise, RobotLifts};
 
@@ -118,8 +118,8 @@ fn adapt_to_lifts(hand: &Hand, model: &Model, read: &Examples, robots: &[String]
     let is_unlike = n_outside as f64 > UNLIKE_SHARE * all.len() as f64;
     let mut adapted = if is_unlike { wider } else { model.clone() };
     // The place of a threshold among grasps that the model does not know means nothing: there it keeps its probability.
-    let (prior, drop_secs) = if is_unlike { (OF_AN_UNLIKE_ROBOT, None) } else { (OF_A_ROBOT, model.drop_secs(look)) };
-    let own = Judged { classifier, prior, drop_secs, n_grasps, lifts: &lifts }.learn(&folds);
+    let (prior, drop_costs) = if is_unlike { (OF_AN_UNLIKE_ROBOT, None) } else { (OF_A_ROBOT, model.drop_costs(look)) };
+    let own = Judged { classifier, prior, drop_costs, n_grasps, lifts: &lifts }.learn(&folds);
     let of_look = match look {
         Phase::TestLifted => adapted.test_lifted.as_mut().map(|probe| &mut probe.classifier),
         Phase::Squeezed => adapted.squeezed.as_mut().map(|probe| &mut probe.classifier),
@@ -187,7 +187,7 @@ fn judged_lifts<'a>(
 struct Judged<'a> {
     classifier: &'a Classifier,
     prior: Prior,
-    drop_secs: Option<f64>,
+    drop_costs: Option<f64>,
     /// Grasps that the lifts were chosen from.
     n_grasps: f64,
     lifts: &'a [JudgedLift<'a>],
@@ -204,7 +204,7 @@ struct Own {
 
 impl Judged<'_> {
     /// Learns a correction and a threshold, and keeps each only if it is better for objects of other folds: by the log loss, and
-    /// by the time for each kept object.
+    /// by the attempts for each kept object.
     fn learn(&self, folds: &[usize]) -> Own {
         let of_model =
             Learned { correction: Correction::default(), threshold_probability: self.classifier.threshold_probability };
@@ -213,7 +213,7 @@ impl Judged<'_> {
         let (before, after) = (self.tried(|_| of_model), self.tried(|idx| by_fold[folds[idx]]));
         let log_losses = [before.log_loss, after.log_loss];
         let learned = self.learned(|_| true);
-        let is_worth_it = self.drop_secs.is_none() || after.secs_per_kept < before.secs_per_kept;
+        let is_worth_it = self.drop_costs.is_none() || after.attempts_per_kept < before.attempts_per_kept;
         let (learned, tried) = match (after.log_loss < before.log_loss, is_worth_it) {
             (true, true) => (learned, after),
             // The same grasps are lifted as before, with other probabilities.
@@ -230,7 +230,7 @@ impl Judged<'_> {
             .map(|(_, lift)| (lift.log_odds, lift.example.stable))
             .collect();
         let n_grasps = self.n_grasps * used.len() as f64 / self.lifts.len() as f64;
-        Learned::of(self.classifier, self.prior, used.iter().copied(), n_grasps as u64, self.drop_secs)
+        Learned::of(self.classifier, self.prior, used.iter().copied(), n_grasps as u64, self.drop_costs)
     }
 
     /// The same correction with a threshold that lifts the grasps that the model lifts.
@@ -252,9 +252,9 @@ impl Judged<'_> {
         let losses = idxs.map(|idx| log_loss(log_odds(idx), self.lifts[idx].example.stable));
         Tried {
             log_loss: losses.sum::<f64>() / self.lifts.len() as f64,
-            // A robot that keeps nothing takes for ever.
-            secs_per_kept: if n_kept > 0.0 {
-                secs_per_kept(n_lifted / self.n_grasps, n_kept / n_lifted, self.drop_secs.unwrap_or(0.0))
+            // A robot that keeps nothing tries for ever.
+            attempts_per_kept: if n_kept > 0.0 {
+                attempts_per_kept(self.n_grasps / n_lifted, n_kept / n_lifted, self.drop_costs.unwrap_or(0.0))
             } else {
                 f64::INFINITY
             },
@@ -265,7 +265,7 @@ impl Judged<'_> {
 
 struct Tried {
     log_loss: f64,
-    secs_per_kept: f64,
+    attempts_per_kept: f64,
     is_lifted: Vec<bool>,
 }
 

@@ -20,7 +20,7 @@ use blindgrasp_stages::classifier::{Classifier, Predictor};
 use blindgrasp_stages::encoder::{Block, FeatureExtractor, FeltReading};
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::model::Model;
-use blindgrasp_stages::own_lifts::{ATTEMPT_SECS, LIFT_SECS, SQUEEZE_SECS, TEST_LIFT_SECS};
+use blindgrasp_stages::own_lifts::{SQUEEZE_COSTS, TEST_LIFT_COSTS, attempts_per_kept};
 use blindgrasp_stages::probe::{GraspHistory, ProbeModel, n_values, signals};
 use blindgrasp_stages::recipe::Recipe;
 use blindgrasp_stages::training_summary::{Promise, ThresholdPoint};
@@ -236,14 +236,14 @@ pub(super) struct Expected {
     pub(super) kept: f64,
     pub(super) attempts_per_lift: f64,
     pub(super) given_up: f64,
-    /// Time per kept object, seconds; what a drop costs is left out.
-    pub(super) secs_per_kept: f64,
+    /// Attempts and probes for each lift, in attempts.
+    work_per_lift: f64,
 }
 
 impl Expected {
-    /// Time per kept object if each drop takes `drop_secs` more, seconds.
-    fn cost_secs(&self, drop_secs: f64) -> f64 {
-        self.secs_per_kept + drop_secs * (1.0 - self.kept) / self.kept
+    /// Attempts and probes for each kept object if a drop costs as much as `drop_costs` attempts.
+    fn cost(&self, drop_costs: f64) -> f64 {
+        attempts_per_kept(self.work_per_lift, self.kept, drop_costs)
     }
 }
 
@@ -289,18 +289,18 @@ impl Policies {
         Policies { all: policies(grasps, last, stable_from), folds, n_attempts: most_attempts(grasps) }
     }
 
-    /// The policy that takes the least time for each kept object if each drop takes `drop_secs` more, or hardly more time with
+    /// The policy that costs the least for each kept object if a drop costs as much as `drop_costs` attempts, or hardly more with
     /// fewer drops; `None` if nothing is ever lifted.
-    pub(super) fn cheapest(&self, drop_secs: f64) -> Option<Policy> {
-        cheapest(&self.all, drop_secs)
+    pub(super) fn cheapest(&self, drop_costs: f64) -> Option<Policy> {
+        cheapest(&self.all, drop_costs)
     }
 
     /// The bounds of drops for new objects if the policy is chosen like this. Each fold's objects are tried with the policy that is
     /// the cheapest for the probabilities of the other folds, and all objects count.
-    pub(super) fn promise(&self, drop_secs: f64) -> Option<Promise> {
+    pub(super) fn promise(&self, drop_costs: f64) -> Option<Promise> {
         let mut tried = Vec::new();
         for (grasps, policies) in &self.folds {
-            let counts = counts(grasps, cheapest(policies, drop_secs)?.thresholds);
+            let counts = counts(grasps, cheapest(policies, drop_costs)?.thresholds);
             tried.extend(counts.iter().map(|count| count.trials(self.n_attempts)));
         }
         Some(Promise { n_attempts: Some(self.n_attempts), ..promise(&tried)? })
@@ -342,8 +342,8 @@ fn most_attempts(grasps: &[Attempted]) -> u32 {
 }
 
 /// The policy that keeps the most among those whose cost equals the least cost: see [`EQUAL_COST`].
-fn cheapest(policies: &[Policy], drop_secs: f64) -> Option<Policy> {
-    let cost = |policy: &Policy| policy.expected.cost_secs(drop_secs);
+fn cheapest(policies: &[Policy], drop_costs: f64) -> Option<Policy> {
+    let cost = |policy: &Policy| policy.expected.cost(drop_costs);
     let least = policies.iter().map(cost).min_by(f64::total_cmp)?;
     let equal = policies.iter().copied().filter(|policy| cost(policy) <= (1.0 + EQUAL_COST) * least);
     equal.max_by(|a, b| a.expected.kept.total_cmp(&b.expected.kept).then(cost(b).total_cmp(&cost(a))))
@@ -483,7 +483,7 @@ fn trial(count: &Count, chances: &Chances) -> (f64, f64) {
 fn expect(grasps: &[Attempted], thresholds: Thresholds, last: Phase) -> Option<Expected> {
     let objects = counts(grasps, thresholds);
     let chances = Chances::of(&objects);
-    let (mut lifted, mut attempts, mut secs) = (0.0, 0.0, 0.0);
+    let (mut lifted, mut attempts, mut work) = (0.0, 0.0, 0.0);
     let (mut first_lifted, mut first_dropped) = (0.0, 0.0);
     for count in &objects {
         let (n_attempts, none_lifted) = trial(count, &chances);
@@ -495,12 +495,14 @@ fn expect(grasps: &[Attempted], thresholds: Thresholds, last: Phase) -> Option<E
         attempts += n_attempts;
         // The attempts before a lift are a random part of the grasps that are not lifted.
         let n_of = |part: f64| ends + (n_attempts - ends) * (part - count.lifted) / (count.n - count.lifted).max(1.0);
-        let probe_secs = match last {
-            Phase::TestLifted => n_of(count.promising) * SQUEEZE_SECS + n_of(count.promising_squeezed) * TEST_LIFT_SECS,
-            Phase::Squeezed => n_of(count.promising) * SQUEEZE_SECS,
+        let probes = match last {
+            Phase::TestLifted => {
+                n_of(count.promising) * SQUEEZE_COSTS + n_of(count.promising_squeezed) * TEST_LIFT_COSTS
+            }
+            Phase::Squeezed => n_of(count.promising) * SQUEEZE_COSTS,
             _ => 0.0,
         };
-        secs += n_attempts * ATTEMPT_SECS + probe_secs + ends * LIFT_SECS;
+        work += n_attempts + probes;
     }
     // An object that is lifted after its recorded grasps is kept as often as others.
     let kept = if first_lifted > 0.0 { 1.0 - first_dropped / first_lifted } else { 0.0 };
@@ -508,7 +510,7 @@ fn expect(grasps: &[Attempted], thresholds: Thresholds, last: Phase) -> Option<E
         kept,
         attempts_per_lift: attempts / lifted,
         given_up: 1.0 - lifted / objects.len() as f64,
-        secs_per_kept: secs / (kept * lifted),
+        work_per_lift: work / lifted,
     })
 }
 
@@ -546,9 +548,9 @@ mod tests {
         let with = |lift: f64| Thresholds { promising: 0.5, promising_squeezed: 0.0, lift };
         let expected = expect(&grasps, with(0.5), Phase::TestLifted).expect("lifts");
         // In random order, the lift is number 1.5 and 2.5 in the mean. A probe comes before each lift, and in all grasps of b.
-        let secs = (1.5 + 2.5) * ATTEMPT_SECS + (1.0 + 2.5) * (SQUEEZE_SECS + TEST_LIFT_SECS) + 2.0 * LIFT_SECS;
+        let work = (1.5 + 2.5) + (1.0 + 2.5) * (SQUEEZE_COSTS + TEST_LIFT_COSTS);
         assert_eq!((expected.kept, expected.attempts_per_lift, expected.given_up), (0.5, 2.0, 0.0));
-        assert!((expected.secs_per_kept - secs).abs() < 1e-12, "{expected:?}");
+        assert!((expected.work_per_lift - work / 2.0).abs() < 1e-12, "{expected:?}");
         // A higher threshold lifts none of b's grasps, and keeps each object that it lifts. As both shares of lifts, 1/2 and 0,
         // vary less than chance makes them, b has the mean of the two from its fifth attempt on.
         let strict = expect(&grasps, with(0.85), Phase::TestLifted).expect("lifts");
@@ -563,7 +565,7 @@ mod tests {
             grasps(&[("a", 0.9, 0.9, true), ("a", 0.9, 0.3, true), ("a", 0.9, 0.3, true), ("a", 0.9, 0.3, false)]);
         let policies = Policies::new(&grasps, Phase::Squeezed, [1.0, 1.0]);
         let chosen =
-            |drop_secs| policies.cheapest(drop_secs).map(|policy| (policy.thresholds.lift, policy.expected.kept));
+            |drop_costs| policies.cheapest(drop_costs).map(|policy| (policy.thresholds.lift, policy.expected.kept));
         assert_eq!((chosen(0.0), chosen(1000.0)), (Some((0.3, 0.75)), Some((0.9, 1.0))));
     }
 
@@ -599,10 +601,9 @@ mod tests {
             let (given_up, n_attempts) = (none_lifted(MOST_ATTEMPTS), (0..MOST_ATTEMPTS).map(none_lifted).sum::<f64>());
             let lifted = 1.0 - given_up;
             // Half of the grasps that are no lifts are probed.
-            let secs =
-                n_attempts * ATTEMPT_SECS + (lifted + 0.5 * (n_attempts - lifted)) * SQUEEZE_SECS + lifted * LIFT_SECS;
+            let work = n_attempts + (lifted + 0.5 * (n_attempts - lifted)) * SQUEEZE_COSTS;
             for n_grasps in [2, 5, 20] {
-                let (mut of_given_up, mut of_attempts, mut of_secs) = (0.0, 0.0, 0.0);
+                let (mut of_given_up, mut of_attempts, mut of_work) = (0.0, 0.0, 0.0);
                 for _ in 0..n_runs {
                     let mut grasps = Vec::new();
                     for object in 0..480 {
@@ -618,11 +619,11 @@ mod tests {
                     let expected = expect(&grasps, with, Phase::Squeezed).expect("lifts");
                     of_given_up += expected.given_up / f64::from(n_runs);
                     of_attempts += expected.attempts_per_lift / f64::from(n_runs);
-                    of_secs += expected.secs_per_kept / f64::from(n_runs);
+                    of_work += expected.work_per_lift / f64::from(n_runs);
                 }
                 assert!((of_given_up - given_up).abs() < 0.01, "{n_grasps} grasps: {of_given_up} for {given_up}");
                 assert!((of_attempts * lifted / n_attempts - 1.0).abs() < 0.03, "{n_grasps} grasps: {of_attempts}");
-                assert!((of_secs * lifted / secs - 1.0).abs() < 0.03, "{n_grasps} grasps: {of_secs} s");
+                assert!((of_work * lifted / work - 1.0).abs() < 0.03, "{n_grasps} grasps: {of_work}");
             }
         }
     }

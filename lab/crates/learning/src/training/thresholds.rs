@@ -12,15 +12,15 @@ use blindgrasp_stages::training_summary::{Bounded, PolicySummary, Promise};
 /// The aim of thresholds that are chosen for trials, in which a hand grasps again until it lifts.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Aim {
-    /// The least time for each kept object if a drop takes so many seconds more.
-    DropSecs(f64),
+    /// The fewest attempts for each kept object if a drop costs as much as so many.
+    DropCosts(f64),
     /// At most this share of the lifts drops.
     MaxDrops(f64),
 }
 
 /// The prices of a drop that are tried for [`Aim::MaxDrops`], from strict to loose: fixed, so that the tests in this order need no
 /// correction (fixed sequence testing, Angelopoulos et al. 2021, section 3).
-const DROP_SECS: [f64; 10] = [1000.0, 500.0, 240.0, 120.0, 60.0, 30.0, 15.0, 8.0, 4.0, 0.0];
+const DROP_COSTS: [f64; 10] = [300.0, 150.0, 80.0, 40.0, 20.0, 10.0, 5.0, 2.5, 1.2, 0.0];
 
 /// The threshold of a look that never lifts.
 const NEVER: f64 = 1.0;
@@ -29,7 +29,7 @@ const NEVER: f64 = 1.0;
 struct Chosen {
     look: Phase,
     policy: Policy,
-    drop_secs: f64,
+    drop_costs: f64,
     promise: Option<Promise>,
 }
 
@@ -55,34 +55,34 @@ impl Aim {
     fn choose(self, policies: &Policies, look: Phase, n_grasps: usize) -> Result<Chosen, Refusal> {
         let max_drops = match self {
             Aim::MaxDrops(max_drops) => max_drops,
-            Aim::DropSecs(drop_secs) => {
-                let Some(policy) = policies.cheapest(drop_secs) else {
+            Aim::DropCosts(drop_costs) => {
+                let Some(policy) = policies.cheapest(drop_costs) else {
                     let why = format!(
                         "no threshold leads to a lift when the hand is {}: record more grasps of more objects",
                         look.as_str()
                     );
                     return Err(Refusal { why, at_most: 1.0 });
                 };
-                return Ok(Chosen { look, policy, drop_secs, promise: policies.promise(drop_secs) });
+                return Ok(Chosen { look, policy, drop_costs, promise: policies.promise(drop_costs) });
             }
         };
         let mut passed = None;
-        for drop_secs in DROP_SECS {
-            match policies.promise(drop_secs) {
-                Some(promise) if promise.drops_of_lifts.at_most <= max_drops => passed = Some((drop_secs, promise)),
+        for drop_costs in DROP_COSTS {
+            match policies.promise(drop_costs) {
+                Some(promise) if promise.drops_of_lifts.at_most <= max_drops => passed = Some((drop_costs, promise)),
                 _ => break,
             }
         }
-        if let Some((drop_secs, mut promise)) = passed
-            && let Some(policy) = policies.cheapest(drop_secs)
+        if let Some((drop_costs, mut promise)) = passed
+            && let Some(policy) = policies.cheapest(drop_costs)
         {
             // The sequence of tests bounds drops by this share, and not by the bound that the last test alone gives.
             promise.drops_of_lifts = Bounded { at_most: max_drops, ..promise.drops_of_lifts };
             promise.drops_of_trials = Bounded { at_most: max_drops, ..promise.drops_of_trials };
-            return Ok(Chosen { look, policy, drop_secs, promise: Some(promise) });
+            return Ok(Chosen { look, policy, drop_costs, promise: Some(promise) });
         }
         let look = look.as_str();
-        let Some(promise) = policies.promise(DROP_SECS[0]) else {
+        let Some(promise) = policies.promise(DROP_COSTS[0]) else {
             let why = format!("nothing is lifted when the hand is {look}: record more grasps of more objects");
             return Err(Refusal { why, at_most: 1.0 });
         };
@@ -107,11 +107,10 @@ impl Chosen {
         PolicySummary {
             roc_area,
             look: self.look.as_str().into(),
-            drop_secs: self.drop_secs,
+            drop_costs: self.drop_costs,
             kept: self.policy.expected.kept,
             attempts_per_lift: self.policy.expected.attempts_per_lift,
             given_up: self.policy.expected.given_up,
-            secs_per_kept: self.policy.expected.secs_per_kept,
             promise: self.promise,
             curve,
         }
@@ -134,7 +133,7 @@ pub(super) fn choose_thresholds(
     let settled = out_of_fold_probabilities(judged)?;
     let (chosen_looks, refusals) = choose_looks(aim, n_grasps, judged, &settled, probes);
     let best = refusals.iter().min_by(|a, b| a.at_most.total_cmp(&b.at_most));
-    if (chosen_looks.is_empty() || matches!(aim, Aim::DropSecs(_)))
+    if (chosen_looks.is_empty() || matches!(aim, Aim::DropCosts(_)))
         && let Some(Refusal { why, at_most }) = best
     {
         return Err(TrainingError::Promise { why: why.clone(), at_most: *at_most });
@@ -210,7 +209,7 @@ fn choose_looks(
             Ok(chosen) => {
                 match (look, aim) {
                     (Phase::Settled, _) => stable_from[0] = chosen.policy.thresholds.lift,
-                    (Phase::Squeezed, Aim::DropSecs(_)) => stable_from[1] = chosen.policy.thresholds.lift,
+                    (Phase::Squeezed, Aim::DropCosts(_)) => stable_from[1] = chosen.policy.thresholds.lift,
                     // With a promise, a tight hand is not lifted before its test lift, so that no threshold of its own lets
                     // it go on.
                     _ => {}
