@@ -42,7 +42,7 @@ pub(super) struct Layout {
     edge_radius_m: f64,
     #[serde(default)]
     cell_unit: CellUnit,
-    #[serde(default = "default_median_filter")]
+    #[serde(default)]
     median_filter: bool,
     pads: Vec<LayoutPad>,
     layouts: BTreeMap<String, Vec<LayoutCell>>,
@@ -86,10 +86,6 @@ struct LayoutCell {
 
 fn default_self_collision_margin_m() -> f64 {
     0.0005
-}
-
-fn default_median_filter() -> bool {
-    true
 }
 
 pub(super) fn parse(path: &Path, text: &str) -> Result<Layout, HandError> {
