@@ -365,17 +365,21 @@ mod tests {
     fn a_low_thing_is_met_from_above_by_fingers_that_stay_off_the_stand() {
         let hand = Hand::load(std::path::Path::new("barrett-bh8-280")).expect("built in");
         let options = TrialOptions::default();
-        let can = targets_named("can-06").expect("a can of 34 mm").remove(0);
-        let from_anywhere = draw_start(&hand, &can, &options, 3, 0, 0);
+        let low = targets_named("ball-07,can-06,spoon-00").expect("43, 34 and 9 mm high");
+        let from_anywhere = draw_start(&hand, &low[0], &options, 3, 0, 0);
         assert!(matches!(from_anywhere, Err(TrialError::NoApproach { .. })), "{from_anywhere:?}");
-        for attempt in [0, 1] {
-            let start = choose_start(&hand, &can, &options, None, 3, 0, attempt).expect("a start");
-            let mut attempt = Attempt::begin(&hand, &can, &options, &start, 0).expect("an attempt");
-            while attempt.next_frame(0).is_some() {}
-            let contacts = attempt.contacts();
-            assert!(contacts.iter().any(|contact| contact.of_object), "it closes on the can");
-            assert!(contacts.iter().all(|contact| contact.of_object || contact.point.other.is_some()));
-        }
+        let starts =
+            [0, 1].map(|attempt| choose_start(&hand, &low[0], &options, None, 3, 0, attempt).expect("a start"));
+        assert!(starts.iter().all(|start| start.back_off_m > 0.05), "{starts:?}");
+        let spoon = choose_start(&hand, &low[2], &options, None, 3, 0, 0);
+        assert!(matches!(spoon, Err(TrialError::NoApproach { .. })), "{spoon:?}");
+
+        let start = choose_start(&hand, &low[1], &options, None, 3, 0, 0).expect("a start");
+        let mut attempt = Attempt::begin(&hand, &low[1], &options, &start, 0).expect("an attempt");
+        while attempt.next_frame(0).is_some() {}
+        let contacts = attempt.contacts();
+        assert!(contacts.iter().any(|contact| contact.of_object), "it closes on the can");
+        assert!(contacts.iter().all(|contact| contact.of_object || contact.point.other.is_some()));
     }
 
     #[test]
