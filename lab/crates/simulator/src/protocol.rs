@@ -200,7 +200,7 @@ impl Mechanism<'_> {
             let posture = posture(&open_joints, &joints, f64::INFINITY);
             let Some(push) = self.push(object, &palm_from_object, &posture, &joints, options)? else { break };
             let pushed = Translation3::from(push) * palm_from_object;
-            if !self.is_apart(object, &pushed, &open_joints)? {
+            if !self.is_apart(object, &pushed, &open_joints, 0.0)? {
                 break;
             }
             palm_from_object = pushed;
@@ -281,18 +281,21 @@ impl Mechanism<'_> {
         Some((closest.distance_m, direction))
     }
 
-    /// Whether no link of the hand is in the object.
-    fn is_apart(
+    /// Whether all links of the hand are farther from the object than `from_m`, at most 2 mm.
+    pub(crate) fn is_apart(
         &self,
         object: &Object,
         palm_from_object: &Isometry3<f64>,
         posture: &[f64],
+        from_m: f64,
     ) -> Result<bool, JointError> {
         let palm_from_links = self.hand.palm_from_links(posture)?;
         let object_pose = pose_from_isometry(palm_from_object);
         Ok(self.shapes.iter().all(|shape| {
             let pose = shape.pose_in_palm(&palm_from_links);
-            shape.closest_to_object(&pose, &object_pose, object, EXACT_M).is_none_or(|closest| closest.distance_m > 0.0)
+            shape
+                .closest_to_object(&pose, &object_pose, object, EXACT_M)
+                .is_none_or(|closest| closest.distance_m > from_m)
         }))
     }
 
@@ -446,7 +449,8 @@ fn stop_m(options: &ProtocolOptions) -> f64 {
     options.touch_tolerance_m / 2.0
 }
 
-fn posture(open_joints: &[f64], joints: &[ClosingJoint], progress: f64) -> Vec<f64> {
+/// The joints at a progress of closing.
+pub(crate) fn posture(open_joints: &[f64], joints: &[ClosingJoint], progress: f64) -> Vec<f64> {
     let mut posture = open_joints.to_vec();
     for joint in joints {
         posture[joint.joint_idx] += joint.rate * progress.min(joint.end);

@@ -155,7 +155,12 @@ impl<'a> Attempt<'a> {
         let Some(touch) = first_touch(&mechanism, target, start)? else {
             return Err(TrialError::NoApproach { target: target.object.name.clone(), n_draws: 1 });
         };
-        let stand_off = Isometry3::translation(0.0, 0.0, options.protocol.stand_off_m);
+        let mut stand_off_m = options.protocol.stand_off_m;
+        if start.back_off_m > 0.0 {
+            // Nothing stops the hand there but the end of its way.
+            stand_off_m += start.back_off_m + OVERSHOOT_M;
+        }
+        let stand_off = Isometry3::translation(0.0, 0.0, stand_off_m);
         let palm_from_world = stand_off * touch.palm_from_world;
         let (plan, body) = HandBody::new(&mechanism, &start.open_joints, &options.physics)?;
         let (standing, physics) = (&touch.world_from_target, &options.physics);

@@ -70,6 +70,9 @@ pub struct Start {
     pub open_joints: Vec<f64>,
     /// The target's turn about the vertical.
     pub yaw_rad: f64,
+    /// How far before its first touch the hand stops, so that its fingers can close over the stand. 0: it goes on until it
+    /// touches.
+    pub back_off_m: f64,
 }
 
 /// Why there can be no trial.

@@ -21,7 +21,7 @@ use std::path::Path;
 
 use rayon::prelude::*;
 
-use super::{LiftTarget, TrialError, TrialOptions, draw_start};
+use super::{LiftTarget, TrialError, TrialOptions, choose_start};
 use crate::option_check::require;
 use blindgrasp_objects::{NamedError, Object, PaperShape, SelectionError, objects_named};
 use blindgrasp_stages::hand::Hand;
@@ -110,7 +110,7 @@ pub fn check_approaches(
     let refused: Vec<TrialError> = targets[..n_tried]
         .par_iter()
         .enumerate()
-        .filter_map(|(trial, target)| draw_start(hand, target, options, seed, trial as u64, 0).err())
+        .filter_map(|(trial, target)| choose_start(hand, target, options, None, seed, trial as u64, 0).err())
         .collect();
     let is_all = refused.len() == n_tried;
     let mut left_out = Vec::new();
