@@ -22,7 +22,6 @@ use crate::beginning::FileNode;
 struct Params {
     votes: u32,
     min_probability_stable: f64,
-    min_probability_promising: f64,
     max_gap_ms: f64,
     max_age_ms: f64,
     probe: Probe,
@@ -49,12 +48,6 @@ pub(crate) fn describe() -> OperatorDescription {
             Some(default.min_probability_stable.into()),
             "The least probability that counts as stable, in place of the model's own threshold; 0 keeps the model's. Below that \
              the model's bound on drops does not hold",
-        )
-        .live_param(
-            "min_probability_promising",
-            share.clone(),
-            Some(default.min_probability_promising.into()),
-            "The least probability with which a grasp is probed, in place of the model's; 0 keeps those. Below, its bound is not proven",
         )
         .live_param(
             "max_gap_ms",
@@ -121,7 +114,6 @@ impl Params {
         ArbiterOptions {
             votes: self.votes,
             min_probability_stable: self.min_probability_stable,
-            min_probability_promising: self.min_probability_promising,
             max_gap_nanos: (self.max_gap_ms * 1e6) as u64,
             max_age_nanos: (self.max_age_ms * 1e6) as u64,
             probe: self.probe,

@@ -2,7 +2,7 @@
 //! them for x86-64.
 
 use std::collections::{BTreeMap, VecDeque};
-use std::io::{BufRead, BufReader, Write};
+use std::io::{BufRead, BufReader, Read as _, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdout, Command, Stdio};
 
@@ -167,7 +167,9 @@ impl Node {
     /// It ends as any program when it is asked to, without a traceback.
     fn stop(mut self) {
         crate::common::signal(self.0.id() as i32, rustix::process::Signal::TERM);
-        assert!(self.0.wait().expect("ended").success());
+        let mut said = String::new();
+        self.0.stderr.take().expect("stderr").read_to_string(&mut said).expect("read");
+        assert!(self.0.wait().expect("ended").success(), "{said}");
     }
 }
 

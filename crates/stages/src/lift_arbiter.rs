@@ -34,9 +34,6 @@ pub struct ArbiterOptions {
     /// The least probability with which a prediction counts as stable, in place of the model's own threshold, which may be higher;
     /// 0 keeps the model's.
     pub min_probability_stable: f64,
-    /// The least probability with which a prediction counts as promising, so that the grasp is probed, in place of the model's own
-    /// thresholds; 0 keeps the model's.
-    pub min_probability_promising: f64,
     /// Greatest time between two predictions of a grasp by the source's clock. A later one counts as stale, unless the source
     /// is as slow as that (`SourcePace`).
     pub max_gap_nanos: u64,
@@ -83,7 +80,6 @@ impl Default for ArbiterOptions {
             votes: 3,
             // The model's own threshold is enough, because training chose it.
             min_probability_stable: 0.0,
-            min_probability_promising: 0.0,
             // Ten periods at 100 Hz: single lost frames are found by their numbers, so a gap means that the source stood still.
             max_gap_nanos: 100_000_000,
             // Twice the gap: a prediction that waited longer may be of a hand that has moved since.
@@ -255,7 +251,7 @@ impl OpenGrasp {
         let is_before_probe = self.is_before_test_lift || self.asks_for(options).is_some();
         let vote = if !is_before_probe {
             Vote::of(prediction, options)
-        } else if options.is_promising(prediction) {
+        } else if prediction.stable || prediction.unsure {
             Vote::Promising
         } else {
             Vote::Unstable
@@ -361,15 +357,6 @@ impl Vote {
 }
 
 impl ArbiterOptions {
-    /// Whether a prediction before the probe says that the grasp may be stable.
-    fn is_promising(&self, prediction: &Prediction) -> bool {
-        if self.min_probability_promising > 0.0 {
-            prediction.probability_stable >= self.min_probability_promising
-        } else {
-            prediction.stable || prediction.unsure
-        }
-    }
-
     /// Whether a prediction that may decide counts as stable only because `min_probability_stable` is below the model's own
     /// threshold: then the model's bound on drops does not hold.
     pub fn loosens(&self, prediction: &Prediction) -> bool {
@@ -422,9 +409,7 @@ impl LiftArbiter {
             self.state.promise = PromiseMonitor::default();
         }
         // A bound is of lifts by one rule.
-        let rule = |of: &ArbiterOptions| {
-            (of.lifts_per_object, of.min_probability_stable, of.min_probability_promising, of.votes, of.probe)
-        };
+        let rule = |of: &ArbiterOptions| (of.lifts_per_object, of.min_probability_stable, of.votes, of.probe);
         if rule(&self.state.options) != rule(&options) {
             self.state.promise.begin_anew();
         }
@@ -1123,19 +1108,6 @@ mod tests {
             ArbiterOptions { min_probability_stable: 0.05, probe: Probe::TestLift, ..ArbiterOptions::default() };
         stream(options).takes("---[0 Hold Unstable]");
         assert!(!options.loosens(&prediction('-')));
-    }
-
-    #[test]
-    fn a_grasp_is_probed_from_a_chosen_probability_on_and_lifted_after_the_probe_alone() {
-        // The model calls 0.1 unstable and 0.4 unsure.
-        for (min_probability_promising, history) in [
-            (0.0, "---[0 Hold Unstable]"),
-            (0.05, "---[0 TestLift Promising]sppplttt[0 Lift Stable]"),
-            (0.5, "???[0 Hold Unstable]"),
-        ] {
-            let probe = Probe::TestLift;
-            stream(ArbiterOptions { min_probability_promising, probe, ..ArbiterOptions::default() }).takes(history);
-        }
     }
 
     #[test]

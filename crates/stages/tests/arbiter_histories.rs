@@ -162,12 +162,8 @@ fn may_ask(history: &[Input], options: &ArbiterOptions) -> bool {
     let row = &history[history.len().saturating_sub(options.votes as usize)..];
     row.len() == options.votes as usize
         && row.iter().all(|input| {
-            let Prediction { stable, unsure, probability_stable, .. } = input.prediction;
-            let is_promising = match options.min_probability_promising {
-                0.0 => stable || unsure,
-                least => probability_stable >= least,
-            };
-            input.is_settled() && is_promising && is_plain_prediction(input, options)
+            let Prediction { stable, unsure, .. } = input.prediction;
+            input.is_settled() && (stable || unsure) && is_plain_prediction(input, options)
         })
 }
 
@@ -426,12 +422,11 @@ fn no_history_of_a_slow_hand_lifts_after_a_gap_that_is_long_for_this_hand() {
 
 #[test]
 fn no_history_with_a_probe_lifts_before_the_probe_was_asked_for_and_felt() {
-    for (votes, min_probability_promising) in [(1, 0.0), (1, 0.05), (2, 0.0)] {
+    for votes in [1, 2] {
         let options = ArbiterOptions {
             votes,
             probe: Probe::TestLift,
             min_probability_stable: 0.6,
-            min_probability_promising,
             promised_drops: 0.0,
             ..ArbiterOptions::default()
         };

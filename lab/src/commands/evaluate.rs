@@ -57,9 +57,6 @@ pub(super) struct Arguments {
     /// The probe after which the model's arbiter decides: none, squeeze or test_lift; the recordings need its frames.
     #[arg(long, default_value = "none", value_parser = |text: &str| word::<Probe>(text, "none, squeeze or test_lift"), conflicts_with = "split")]
     probe: Probe,
-    /// Probe grasps from this probability on, as lift_arbiter.min_probability_promising says to a graph.
-    #[arg(long, value_name = "PROBABILITY", value_parser = |text: &str| number_in(text, 0.0..=1.0), conflicts_with = "split")]
-    min_promising: Option<f64>,
     /// Train recipes on a part of the grasps and judge the rest, by folds that share no grasp, object or class.
     #[arg(long, value_parser = ["grasp", "object", "class"])]
     split: Option<String>,
@@ -117,8 +114,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
             arguments.inputs.first().map_or(Path::new(""), PathBuf::as_path).display()
         ),
         (None, None) if arguments.is_for_a_model() => bail!(
-            "--probe, --min-promising, --drop-costs: predictions are judged as they are: give a model as well, or leave these options \
-             out"
+            "--probe, --drop-costs: predictions are judged as they are: give a model as well, or leave these options out"
         ),
         (Some(model), None) if recordings.is_empty() => {
             bail!("nothing to judge {} on: name recordings after it", model.display())
@@ -126,12 +122,9 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         _ => {}
     }
     // Check files before the long work.
-    let mut model = model.map(|path| Ok::<_, anyhow::Error>((path, Model::load(path)?))).transpose()?;
-    if let Some((path, model)) = &mut model {
+    let model = model.map(|path| Ok::<_, anyhow::Error>((path, Model::load(path)?))).transpose()?;
+    if let Some((path, model)) = &model {
         check_probe(path, model, arguments.probe)?;
-        if let Some(least) = arguments.min_promising.filter(|least| *least > 0.0) {
-            probe_from(path, model, least)?;
-        }
     }
     let recordings = recordings_in(recordings)?;
     let inputs = [recordings.as_slice(), &arguments.inputs, arguments.predictions.as_slice()].concat();
@@ -159,18 +152,8 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
 
 impl Arguments {
     fn is_for_a_model(&self) -> bool {
-        self.probe != Probe::None || self.min_promising.is_some() || self.drop_costs.is_some()
+        self.probe != Probe::None || self.drop_costs.is_some()
     }
-}
-
-/// Lets the model call a grasp promising from this probability on.
-fn probe_from(path: &Path, model: &mut Model, least: f64) -> anyhow::Result<()> {
-    let Some(squeezed) = &mut model.squeezed else {
-        bail!("--min-promising: {} knows no probe: give a model that was trained on lifts", path.display());
-    };
-    model.classifier.unsure_from_probability = least;
-    squeezed.classifier.unsure_from_probability = least;
-    Ok(())
 }
 
 /// Refuses a probe after which the model judges nothing: every grasp would be held.
@@ -199,9 +182,7 @@ struct Job<'a> {
 
 impl Job<'_> {
     fn model(self, path: &Path, model: &Model) -> anyhow::Result<Outcome> {
-        let Arguments { probe, min_promising, .. } = *self.arguments;
-        let min_probability_promising = min_promising.unwrap_or(0.0);
-        let options = ArbiterOptions { probe, min_probability_promising, ..ArbiterOptions::default() };
+        let options = ArbiterOptions { probe: self.arguments.probe, ..ArbiterOptions::default() };
         let evaluated = evaluate(self.hand, model, self.recordings, &options)?;
         let is_table = !self.arguments.json;
         if is_table {

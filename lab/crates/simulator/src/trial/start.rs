@@ -257,22 +257,16 @@ fn draw_in_turn(
     attempt: u32,
 ) -> Result<Start, TrialError> {
     let is_blind = options.protocol.approach == Approach::Blind;
-    let is_straight_down = attempt.is_multiple_of(2);
-    if is_blind
-        && is_straight_down
-        && let Some(start) = draw_straight_down(hand, target, options, seed, trial, attempt)?
-    {
+    let is_straight_down = is_blind && attempt.is_multiple_of(2);
+    if is_straight_down && let Some(start) = draw_straight_down(hand, target, options, seed, trial, attempt)? {
         return Ok(start);
     }
-    let drawn = draw_start(hand, target, options, seed, trial, attempt);
-    if is_blind
-        && !is_straight_down
-        && matches!(drawn, Err(TrialError::NoApproach { .. }))
-        && let Some(start) = draw_straight_down(hand, target, options, seed, trial, attempt)?
-    {
-        return Ok(start);
+    match draw_start(hand, target, options, seed, trial, attempt) {
+        Err(missed @ TrialError::NoApproach { .. }) if is_blind && !is_straight_down => {
+            draw_straight_down(hand, target, options, seed, trial, attempt)?.ok_or(missed)
+        }
+        drawn => drawn,
     }
-    drawn
 }
 
 fn probability_kept(prior: &ApproachPrior, start: &Start) -> f64 {
