@@ -467,7 +467,7 @@ impl Model {
         }
     }
 
-    /// The price of a drop that the threshold of a look was chosen for, seconds.
+    /// The price of a drop that the threshold of a look was chosen for, in attempts.
     pub fn drop_costs(&self, look: Phase) -> Option<f64> {
         self.training.policies.iter().find(|policy| policy.look == look.as_str()).map(|policy| policy.drop_costs)
     }
