@@ -255,9 +255,10 @@ def serve(arguments):
 
     echo = [arguments.program, "echo", "--cdr", "--graph", arguments.graph, *arguments.outputs]
     top = [arguments.program, "top", "--json", arguments.graph]
+    # It is made before the threads say something: a program that hears the node may end it.
+    node.create_timer(1.0, publishing.take_back, clock=Clock(clock_type=ClockType.STEADY_TIME))
     threading.Thread(target=work, args=(echo, publishing.take, publishing.begin_anew), daemon=True).start()
     threading.Thread(target=work, args=(top, publishing.diagnose, publishing.has_no_state), daemon=True).start()
-    node.create_timer(1.0, publishing.take_back, clock=Clock(clock_type=ClockType.STEADY_TIME))
     spin(node, MultiThreadedExecutor(num_threads=MAX_WAITING + 4))
     # The threads may be in rclpy, which an orderly end of Python would take from them.
     os._exit(0)

@@ -18,9 +18,9 @@ def spin(node, executor=None):
     import rclpy
     from rclpy.clock import Clock, ClockType
 
-    # rclpy can fall asleep on a signal that comes just then; it looks again when it wakes.
-    node.create_timer(1.0, lambda: None, clock=Clock(clock_type=ClockType.STEADY_TIME))
     try:
+        # rclpy can fall asleep on a signal that comes just then; it looks again when it wakes.
+        node.create_timer(1.0, lambda: None, clock=Clock(clock_type=ClockType.STEADY_TIME))
         rclpy.spin(node, executor)
     except KeyboardInterrupt:
         pass
