@@ -43,12 +43,13 @@ pub struct TrialProtocol {
     /// training data.
     pub lateral_offset_m: f64,
     /// Least descent of the approach, from level; directions are uniform over the rest of the sphere. 0: level approaches
-    /// are tried as well, where the stand lets them. Every second blind attempt of a trial comes straight down whatever it is.
+    /// are tried as well, where the stand lets them. It is not for every second blind attempt of a
+    /// trial, which comes straight down.
     pub least_descent_rad: f64,
     /// Approaches of which one is chosen where a model says which are kept more often, 1 to 8. 8.
     pub n_approaches: u32,
-    /// Least distance of the open hand from the stand, and straight down of the closing one. A nearer approach is drawn
-    /// again, or stops before. 5 mm.
+    /// Least distance of the open hand from the stand; a nearer approach is drawn again. An attempt straight down keeps it
+    /// while the hand closes. 5 mm.
     pub stand_clearance_m: f64,
     /// Time between frames. 10 ms: 100 Hz.
     pub frame_nanos: u64,
