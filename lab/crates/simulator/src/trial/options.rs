@@ -43,7 +43,7 @@ pub struct TrialProtocol {
     /// training data.
     pub lateral_offset_m: f64,
     /// Least descent of the approach, from level; directions are uniform over the rest of the sphere. 0: level approaches
-    /// are tried as well, where the stand lets them. Attempts straight down do not heed it.
+    /// are tried as well, where the stand lets them. Attempts straight down have 1.4 rad at least.
     pub least_descent_rad: f64,
     /// Approaches of which one is chosen where a model says which are kept more often, 1 to 8. 8.
     pub n_approaches: u32,
