@@ -5,6 +5,14 @@ use serde_json::json;
 
 use crate::dataflow::Node;
 
+/// The name of the metadata about the graph.
+pub const GRAPH_METADATA: &str = "graph";
+
+/// The name of the attached file of a node's model.
+pub fn attached_model(node: &str) -> String {
+    format!("model of {node}.json")
+}
+
 /// How a recording ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]

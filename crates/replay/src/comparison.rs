@@ -12,6 +12,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use super::played::is_played;
+use blindgrasp_graph::recorded_graph::GRAPH_METADATA;
 use blindgrasp_messages::{Header, with_sample};
 use blindgrasp_recording::cdr;
 use blindgrasp_recording::{ChosenSamples, Reach, Record, RecordingError, RecordingReader};
@@ -143,11 +144,11 @@ impl Coverage {
     pub fn of(recording: &Path, source_topic: &str) -> Result<Coverage, CompareError> {
         let reader = RecordingReader::open(recording)?;
         let says = |name: &str, key: &str| reader.metadata(name).and_then(|metadata| metadata.get(key)).cloned();
-        let is_attached = says("graph", "began").as_deref() == Some("attached");
+        let is_attached = says(GRAPH_METADATA, "began").as_deref() == Some("attached");
         let ended = says("end", "ended");
         let is_detached = ended.as_deref() == Some("detached");
         // A killed recorder leaves no `end`; its last samples are on some edges and not on others.
-        let is_live = reader.metadata("graph").is_some();
+        let is_live = reader.metadata(GRAPH_METADATA).is_some();
         let is_cut_off =
             reader.metadata("repair").is_some() || (is_live && !is_detached && ended.as_deref() != Some("graph"));
         let hand_id = reader.info().hand_id;

@@ -1,12 +1,15 @@
 //! Writing a recording anew with the results of a replay of it.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::iter::Peekable;
 use std::path::Path;
+
+use serde_json::Value;
 
 use super::comparison::Coverage;
 use super::played::is_played;
 use super::rewrite::{FedEdge, Origin};
+use blindgrasp_graph::recorded_graph::{GRAPH_METADATA, attached_model};
 use blindgrasp_messages::with_sample;
 use blindgrasp_recording::{
     Attachment, Record, RecordingError, RecordingReader, RecordingWriter, ShownHand, TOPICS_FOR_VIEWERS, attachments,
@@ -23,8 +26,9 @@ pub enum UpdateError {
     OtherTopic { topic: String, schema: String },
 }
 
-/// Writes the recording anew and says what it wrote. The edges of the replay take the place of the recorded ones; the
-/// played topic, labels, scenes, metadata, attachments, and the edges of stages that did not run stay. Topics for viewers are
+/// Writes the recording anew and says what it wrote. The edges of the replay take the place of the recorded ones, and so do
+/// parameters, versions and models of the nodes that ran, if the recording says which it had. The played topic, labels, scenes,
+/// other metadata and attachments, and the edges of stages that did not run stay. Topics for viewers are
 /// made again if the files of the recording's hand are attached: then this library has written them.
 ///
 /// # Errors
@@ -38,7 +42,7 @@ pub fn update(
     hand: Option<ShownHand>,
 ) -> Result<String, UpdateError> {
     let reader = RecordingReader::open(recording)?;
-    let attachments = attachments(recording)?;
+    let mut attachments = attachments(recording)?;
     let is_shown = attachments.iter().any(|file| file.name == ShownHand::URDF_NAME);
     let hand = if is_shown { hand } else { None };
     let is_lost = |(topic, schema): &(&String, &String)| {
@@ -54,13 +58,21 @@ pub fn update(
         let edge = of_stages().find(|edge| edge.found_topic == topic)?;
         Some(edge.recorded_topic.clone())
     };
-    let mut new_samples = RecordingReader::open(found)?
+    let replay = RecordingReader::open(found)?;
+    let mut metadata = reader.all_metadata().clone();
+    if let (Some(about), Some(of_replay)) = (metadata.get_mut(GRAPH_METADATA), replay.metadata(GRAPH_METADATA)) {
+        let has_run = update_graph(about, of_replay);
+        attachments.retain(|file| !has_run.iter().any(|node| file.name == attached_model(node)));
+        let files = self::attachments(found)?.into_iter();
+        attachments.extend(files.filter(|file| has_run.iter().any(|node| file.name == attached_model(node))));
+    }
+    let mut new_samples = replay
         .filter_map(|record| match record {
             Ok((topic, record)) => new_name(&topic).map(|topic| Ok((topic, with_recorded_number(record, coverage)))),
             Err(error) => Some(Err(error)),
         })
         .peekable();
-    let mut writer = begin(recording, &reader, &attachments, hand)?;
+    let mut writer = begin(recording, &reader, metadata, &attachments, hand)?;
     for record in reader {
         let (topic, record) = record?;
         if replaced.contains(topic.as_str()) {
@@ -76,16 +88,44 @@ pub fn update(
     Ok(format!("updated: {}", written.join(", ")))
 }
 
-/// Begins the new recording with the metadata and attachments of the old one.
+/// Gives the nodes that ran in the replay the parameters, versions and models that they had there, and returns their names. The
+/// sources did not run: the replay has its own.
+fn update_graph(about: &mut BTreeMap<String, String>, of_replay: &BTreeMap<String, String>) -> Vec<String> {
+    let read = |from: &BTreeMap<String, String>, key: &str| -> Value {
+        from.get(key).and_then(|text| serde_json::from_str(text).ok()).unwrap_or_default()
+    };
+    let mut graph = read(about, "graph");
+    let ran = read(of_replay, "graph");
+    let mut has_run = Vec::new();
+    for node in graph["nodes"].as_array_mut().into_iter().flatten() {
+        let same = ran["nodes"].as_array().into_iter().flatten().find(|other| other["id"] == node["id"]);
+        if let Some(same) = same.filter(|same| same["inputs"].as_array().is_some_and(|inputs| !inputs.is_empty())) {
+            has_run.extend(same["id"].as_str().map(String::from));
+            *node = same.clone();
+        }
+    }
+    about.insert("graph".into(), graph.to_string());
+    for key in ["models", "operator_versions"] {
+        let (mut all, new) = (read(about, key), read(of_replay, key));
+        for node in &has_run {
+            all[node] = new[node].clone();
+        }
+        about.insert(key.into(), all.to_string());
+    }
+    has_run
+}
+
+/// Begins the new recording with this metadata and these attachments.
 fn begin(
     recording: &Path,
     reader: &RecordingReader,
+    metadata: BTreeMap<String, BTreeMap<String, String>>,
     attachments: &[Attachment<'_>],
     hand: Option<ShownHand>,
 ) -> Result<RecordingWriter, RecordingError> {
     let mut writer = RecordingWriter::create(recording, reader.info())?;
-    for (name, metadata) in reader.all_metadata() {
-        writer.write_metadata(name, metadata.clone())?;
+    for (name, metadata) in metadata {
+        writer.write_metadata(&name, metadata)?;
     }
     for file in attachments {
         // The hand's own files are attached with it.
@@ -127,8 +167,9 @@ fn with_recorded_number(mut record: Record, coverage: &Coverage) -> Record {
 
 #[cfg(test)]
 mod tests {
-    use std::collections::BTreeMap;
     use std::sync::Arc;
+
+    use serde_json::json;
 
     use super::*;
     use blindgrasp_messages::{ContactSet, Header, Stamped, TactileFrame};
@@ -147,6 +188,47 @@ mod tests {
     fn updated(path: &Path, hand: Option<ShownHand>) -> Result<String, UpdateError> {
         let coverage = Coverage::of(path, "/tactile").expect("covered");
         update(path, path, "/tactile", &[], &coverage, hand)
+    }
+
+    #[test]
+    fn an_update_says_which_models_answered() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let record = |name: &str, source: &str, model: &str| {
+            let path = folder.path().join(name);
+            let info = RecordingInfo { hand: "h".into(), hand_id: 1, made_by: "a test".into(), version: "0".into() };
+            let node = |id: &str, inputs: Value| json!({"id": id, "params": {"model": model}, "inputs": inputs});
+            let graph = json!({"nodes": [node(source, json!([])), node("classifier", json!([{"port": "feature"}]))]});
+            let models = json!({"classifier": model});
+            let about = [("graph", graph), ("models", models)].map(|(key, value)| (key.to_string(), value.to_string()));
+            let files = [("notes.txt", name), ("model of classifier.json", model)];
+            let attachments = files.map(|(file, text)| (file.to_string(), text.as_bytes().to_vec())).into();
+            let metadata = BTreeMap::from([(GRAPH_METADATA.to_string(), BTreeMap::from(about))]);
+            let options = LiveOptions { metadata, attachments, ..LiveOptions::default() };
+            let mut recorder = LiveRecorder::create(&path, &info, options).expect("created");
+            let frame = Stamped { header: Header::default(), message: TactileFrame::default() };
+            recorder.write("/tactile", &Record::Tactile(frame)).expect("written");
+            recorder.finish().expect("finished");
+            path
+        };
+        let (path, found) = (record("run.mcap", "hand", "old"), record("found.mcap", "player", "new"));
+        let coverage = Coverage::of(&path, "/tactile").expect("covered");
+        update(&path, &found, "/tactile", &[], &coverage, None).expect("updated");
+        let reader = RecordingReader::open(&path).expect("opened");
+        let about = reader.metadata(GRAPH_METADATA).expect("there");
+        let graph: Value = serde_json::from_str(&about["graph"]).expect("JSON");
+        let params: Vec<_> = graph["nodes"]
+            .as_array()
+            .expect("nodes")
+            .iter()
+            .map(|node| (&node["id"], &node["params"]["model"]))
+            .collect();
+        assert_eq!(params, [(&json!("hand"), &json!("old")), (&json!("classifier"), &json!("new"))]);
+        assert_eq!(about["models"], r#"{"classifier":"new"}"#);
+        let mut files: Vec<_> =
+            attachments(&path).expect("read").into_iter().map(|file| (file.name, file.data)).collect();
+        files.sort();
+        let file = |name: &str, text: &'static str| (name.to_string(), text.as_bytes().into());
+        assert_eq!(files, [file("model of classifier.json", "new"), file("notes.txt", "run.mcap")]);
     }
 
     #[test]

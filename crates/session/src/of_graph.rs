@@ -6,6 +6,7 @@ use std::time::SystemTime;
 
 use serde_json::{Map, Value, json};
 
+use blindgrasp_graph::recorded_graph::{GRAPH_METADATA, attached_model};
 use blindgrasp_grasps::dataset::{TRUTH_METADATA, label_of};
 use blindgrasp_grasps::shown_hand::shown_hand;
 use blindgrasp_messages::{LiftOutcome, Recorded};
@@ -13,9 +14,6 @@ use blindgrasp_recording::{LiveOptions, RecordingInfo, RecordingReader};
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::label::Label;
 use blindgrasp_stages::model::Model;
-
-/// The name of the metadata about the graph.
-const GRAPH_METADATA: &str = "graph";
 
 /// What is to be recorded of a graph, as [`describe_graph`](blindgrasp_graph::recorded_graph::describe_graph) describes it. The hand
 /// is the one that a node has as its parameter `hand`. `is_at_start` says that the graph has sent no sample yet. The options get
@@ -83,7 +81,7 @@ fn models(graph: &Value) -> (Value, BTreeMap<String, Vec<u8>>) {
         } else if let Ok(model) = Model::load(Path::new(path)) {
             about["dictionary_id"] = format!("{:016x}", model.dictionary_id()).into();
             about["checksum"] = model.checksum.into();
-            files.extend(std::fs::read(path).map(|file| (format!("model of {node}.json"), file)));
+            files.extend(std::fs::read(path).map(|file| (attached_model(node), file)));
         }
         models.insert(node.into(), about);
     }

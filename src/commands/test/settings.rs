@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use blindgrasp_graph::dataflow::{Graph, Node};
+use blindgrasp_graph::recorded_graph::GRAPH_METADATA;
 use blindgrasp_operator::param::ParamKind;
 use blindgrasp_recording::RecordingReader;
 use blindgrasp_stages::model::Model;
@@ -11,7 +12,7 @@ use serde_json::Value;
 /// The params of the recorded graph that have other values than in the dataflow file, as they stand after `--set`. A file that is
 /// not there any more is left out.
 pub(super) fn recorded(recording: &RecordingReader, file_graph: &Graph) -> Vec<String> {
-    let about = recording.metadata("graph").and_then(|about| about.get("graph"));
+    let about = recording.metadata(GRAPH_METADATA).and_then(|about| about.get("graph"));
     let recorded: Value = about.and_then(|text| serde_json::from_str(text).ok()).unwrap_or_default();
     let mut sets = Vec::new();
     for then in recorded["nodes"].as_array().into_iter().flatten() {
@@ -31,7 +32,7 @@ pub(super) fn recorded(recording: &RecordingReader, file_graph: &Graph) -> Vec<S
 
 /// A note on the parameters and models that differ; `None` if none do, or the recording does not say.
 pub(super) fn differing(recording: &RecordingReader, graph: &Graph) -> Option<String> {
-    let about = recording.metadata("graph")?;
+    let about = recording.metadata(GRAPH_METADATA)?;
     let recorded: Value = serde_json::from_str(about.get("graph")?).ok()?;
     let models: Value = about.get("models").and_then(|text| serde_json::from_str(text).ok()).unwrap_or_default();
     let mut differing = Vec::new();
