@@ -3,6 +3,7 @@
 Put the motion of your arm into `lift`. Nothing else may start it.
 """
 
+import argparse
 import time
 
 import rclpy
@@ -10,7 +11,7 @@ from blindgrasp_msgs.msg import Decision
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-from blindgrasp_ros.node import clock_fault, nanos_of, spin, topic_fault
+from blindgrasp_ros.node import arguments, clock_fault, nanos_of, spin, topic_fault
 
 # Two LIFTs of one grasp that are valid until times less than this apart are one decision: a graph needs longer to start.
 SAME_RUN_NANOS = 1_000_000_000
@@ -56,6 +57,7 @@ class LiftGate(Node):
 
 
 def main():
+    argparse.ArgumentParser(description=__doc__).parse_args(arguments())
     rclpy.init()
     spin(LiftGate())
 
