@@ -3,8 +3,8 @@
 use std::net::IpAddr;
 use std::path::PathBuf;
 
-use blindgrasp_graph::link::config::{KeyFiles, ROUTER_COMMON_NAME, key_files};
-use blindgrasp_graph::link::network::{Keys, Network, NetworkError};
+use blindgrasp_graph::link::config::{ROUTER_COMMON_NAME, key_files};
+use blindgrasp_graph::link::network::{Network, NetworkError};
 use blindgrasp_operator::description::OperatorDescription;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::param::ParamKind;
@@ -52,10 +52,7 @@ impl ConnectionParams {
     /// # Errors
     /// An endpoint is not valid, or the keys are of no use to it.
     pub fn network(&self) -> Result<Network, NetworkError> {
-        let keys = self.keys.as_deref().map(|folder| {
-            let KeyFiles { authority, certificate, private_key } = key_files(folder, KEY_NAME);
-            Keys { authority, certificate, private_key }
-        });
+        let keys = self.keys.as_deref().map(|folder| key_files(folder, KEY_NAME));
         let connect = match (&self.connect, &self.listen) {
             (Some(endpoint), _) => vec![endpoint.clone()],
             (None, Some(_)) => vec![],

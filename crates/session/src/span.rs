@@ -31,6 +31,7 @@ pub struct SpanOfEdge {
     pub missing: u64,
 }
 
+#[derive(Default)]
 pub struct EdgeSpan {
     topic: String,
     /// Whether it has the source's numbers.
@@ -82,16 +83,7 @@ impl EdgeSpan {
             is_said_once: type_name == LiftDecision::TYPE_NAME,
             answered_slots: edge.answered_slots.clone(),
             writer_slot: edge.input.writer_slot,
-            place: None,
-            has_begun: false,
-            first: None,
-            last: None,
-            seen: None,
-            until: None,
-            n_samples: 0,
-            n_missing: 0,
-            n_gaps: 0,
-            n_lost: 0,
+            ..EdgeSpan::default()
         }
     }
 
@@ -279,23 +271,7 @@ mod tests {
     }
 
     fn edge(is_numbered: bool, place: Option<SampleId>) -> EdgeSpan {
-        EdgeSpan {
-            topic: "/tactile".into(),
-            is_numbered,
-            is_said_once: false,
-            answered_slots: Vec::new(),
-            writer_slot: 0,
-            place,
-            has_begun: false,
-            first: None,
-            last: None,
-            seen: None,
-            until: None,
-            n_samples: 0,
-            n_missing: 0,
-            n_gaps: 0,
-            n_lost: 0,
-        }
+        EdgeSpan { topic: "/tactile".into(), is_numbered, place, ..EdgeSpan::default() }
     }
 
     #[test]

@@ -5,8 +5,8 @@ use std::process::{Command, Stdio};
 
 use blindgrasp_bridge::keys::revoke;
 use blindgrasp_bridge::outside::{Rights, open};
-use blindgrasp_graph::link::config::{KeyFiles, key_files};
-use blindgrasp_graph::link::network::{Keys, Network};
+use blindgrasp_graph::link::config::key_files;
+use blindgrasp_graph::link::network::Network;
 use serde_json::{Value, json};
 use time::OffsetDateTime;
 use zenoh::{Session, Wait};
@@ -19,10 +19,7 @@ const FRAMES: &str = "hand/frames";
 const DECISIONS: &str = "robot/hand/decision";
 
 fn network(listen: &str, connect: &str, folder: Option<&Path>) -> Network {
-    let keys = folder.map(|folder| {
-        let KeyFiles { authority, certificate, private_key } = key_files(folder, "zenoh");
-        Keys { authority, certificate, private_key }
-    });
+    let keys = folder.map(|folder| key_files(folder, "zenoh"));
     let names = if keys.is_some() { vec!["zenoh".into(), "arm".into()] } else { vec![] };
     let some = |endpoint: &str| if endpoint.is_empty() { vec![] } else { vec![endpoint.to_owned()] };
     Network { connect: some(connect), listen: some(listen), keys, names }

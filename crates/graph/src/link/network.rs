@@ -1,6 +1,6 @@
 //! The way to keys of Zenoh: endpoints and certificates, checked before there is a connection.
 
-use std::path::PathBuf;
+use super::config::KeyFiles;
 
 /// The way to other programs.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -9,17 +9,9 @@ pub struct Network {
     pub connect: Vec<String>,
     /// Endpoints at which others connect.
     pub listen: Vec<String>,
-    pub keys: Option<Keys>,
+    pub keys: Option<KeyFiles>,
     /// With keys: the common names of the certificates that take part.
     pub names: Vec<String>,
-}
-
-/// The files for TLS, in PEM.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Keys {
-    pub authority: PathBuf,
-    pub certificate: PathBuf,
-    pub private_key: PathBuf,
 }
 
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -83,7 +75,7 @@ mod tests {
         for bad in ["tls/localhost:7447", "udp/localhost:7447", "tcp/localhost", "tcp/:1", "tcp/a:1#iface=x"] {
             assert!(network(bad).check().is_err(), "{bad}");
         }
-        let keys = Keys { authority: "a".into(), certificate: "b".into(), private_key: "c".into() };
+        let keys = KeyFiles { authority: "a".into(), certificate: "b".into(), private_key: "c".into() };
         assert!(Network { keys: Some(keys), ..network("tcp/localhost:7447") }.check().is_err());
     }
 }

@@ -2,13 +2,14 @@
 
 mod access;
 
-use blindgrasp_graph::link::network::{Keys, Network, NetworkError};
+use blindgrasp_graph::link::network::{Network, NetworkError};
 use serde_json::json;
 use zenoh::bytes::Encoding;
 use zenoh::pubsub::Publisher;
 use zenoh::qos::{CongestionControl, Priority};
 use zenoh::{Config, Session, Wait};
 
+use super::session::tls_config;
 pub use access::Rights;
 use access::access_control;
 
@@ -55,19 +56,8 @@ pub fn open(network: &Network, rights: &Rights) -> Result<Session, NetworkError>
     });
     let names = network.keys.is_some().then_some(network.names.as_slice());
     config["access_control"] = access_control(rights, names);
-    if let Some(Keys { authority, certificate, private_key }) = &network.keys {
-        config["transport"]["link"]["tls"] = json!({
-            "root_ca_certificate": authority,
-            "enable_mtls": true,
-            "listen_certificate": certificate,
-            "listen_private_key": private_key,
-            "connect_certificate": certificate,
-            "connect_private_key": private_key,
-            // Access control goes by the common name, at any address. The certificates of `blindgrasp keys` bear no address,
-            // and public authorities, which Zenoh's connecting side accepts as well, sign no name without a dot.
-            "verify_name_on_connect": false,
-            "close_link_on_expiration": true,
-        });
+    if let Some(keys) = &network.keys {
+        config["transport"]["link"]["tls"] = tls_config(keys);
     }
     let refused = |error: zenoh::Error| {
         let endpoints = [network.connect.as_slice(), &network.listen].concat().join(", ");
