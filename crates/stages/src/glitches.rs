@@ -13,6 +13,9 @@ use crate::contacts::are_forces;
 use crate::hand::Hand;
 use blindgrasp_messages::Phase;
 
+/// The most cells of a hand whose readings are filtered: the filter keeps two numbers of each, and a node saves 64 KiB.
+pub const MAX_FILTERED_CELLS: usize = 4000;
+
 /// A spike is so many noise thresholds high. A load at the threshold goes to and fro about it.
 const SPIKE_THRESHOLDS: f64 = 3.0;
 /// A grasp flickers if so many readings are spikes, and one in so many frames. A sliding contact makes single ones.

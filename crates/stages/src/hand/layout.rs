@@ -13,6 +13,7 @@ use super::{
     BareHand, Cell, CellUnit, Coupling, Hand, HandError, Joint, JointKind, Link, LinkShape, Motion, Pad,
     pose_from_isometry,
 };
+use crate::glitches::MAX_FILTERED_CELLS;
 use blindgrasp_messages::{MAX_CELLS, MAX_JOINTS, MAX_PADS};
 
 const FORMAT: &str = "blindgrasp-hand/1";
@@ -156,6 +157,12 @@ impl Layout {
             if found < least || found > most {
                 return Err(format!("{found} {what}, expected {least} to {most}"));
             }
+        }
+        if self.median_filter && noise_thresholds_newtons.len() > MAX_FILTERED_CELLS {
+            let found = noise_thresholds_newtons.len();
+            return Err(format!(
+                "median_filter is for at most {MAX_FILTERED_CELLS} cells, and the hand has {found}: leave it out"
+            ));
         }
         if !(0.0..=0.02).contains(&self.self_collision_margin_m) {
             return Err(format!("self_collision_margin_m is {}, expected 0 to 0.02", self.self_collision_margin_m));
