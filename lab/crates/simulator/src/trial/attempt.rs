@@ -591,7 +591,7 @@ impl<'a> Attempt<'a> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::trial::draw_start;
+    use crate::trial::choose_start;
     use crate::trial::targets::targets_named;
 
     fn barrett() -> Hand {
@@ -606,7 +606,7 @@ mod tests {
     fn closed<'a>(hand: &'a Hand, target: &LiftTarget) -> Attempt<'a> {
         let mut options = TrialOptions::default();
         options.physics.stand_radius_m = 0.04;
-        let start = draw_start(hand, target, &options, 3, 0, 0).expect("a start");
+        let start = choose_start(hand, target, &options, None, 3, 0, 0).expect("a start");
         let mut attempt = Attempt::begin(hand, target, &options, &start, 0).expect("an attempt");
         while attempt.next_frame(0).is_some() {}
         attempt

@@ -11,7 +11,8 @@ use rand::RngExt;
 
 use super::attempt::Moment;
 use super::{
-    Attempt, LiftTarget, MujocoOptions, PhysicsOptions, ProbeMove, TrialError, TrialOptions, TrialProtocol, draw_start,
+    Attempt, LiftTarget, MujocoOptions, PhysicsOptions, ProbeMove, TrialError, TrialOptions, TrialProtocol,
+    choose_start,
 };
 use crate::candidate::{CandidateError, Judged, Made, Outcome, SimulatedGrasp, TimedFrame, candidate_rng};
 use crate::loaded_contacts::SimulatedContact;
@@ -42,7 +43,8 @@ pub(crate) fn try_candidate(
     let target = varied(&objects[object_idx], options, &mut rng);
     let start_seed = rng.random();
     let trial_options = trial_options(options, &mut rng);
-    let begun = draw_start(hand, &target, &trial_options, start_seed, 0, 0)
+    // Every second candidate comes as the first attempt of a trial does, and the others as the second.
+    let begun = choose_start(hand, &target, &trial_options, None, start_seed, 0, (candidate % 2) as u32)
         .and_then(|start| Attempt::begin(hand, &target, &trial_options, &start, 0));
     let attempt = match begun {
         Ok(attempt) => attempt,

@@ -35,7 +35,7 @@ pub use attempt::{Attempt, ProbeMove, Reaction};
 pub use mujoco::python_path;
 pub(crate) use options::check_planner;
 pub use options::{MujocoOptions, PhysicsEngine, PhysicsOptions, TrialOptions, TrialProtocol, read_options};
-pub use start::{choose_start, draw_start, sensor_seed};
+pub use start::{choose_start, sensor_seed};
 
 /// An object to lift. Its name and class are those in tables, e.g. `canteen with cover, 0.50 kg` and `canteen`.
 #[derive(Debug, Clone)]

@@ -18,6 +18,9 @@ use blindgrasp_stages::hand::{Hand, pose_from_isometry};
 /// Most approaches that are drawn before the target is given up. Most approaches are possible.
 const MOST_DRAWS: usize = 1000;
 
+/// Most approaches straight down that are drawn: over a flat target all of them fail, and most of the others do not.
+const MOST_DRAWS_STRAIGHT_DOWN: usize = 200;
+
 /// Least descent of an approach straight down, from level: 10° from the vertical, so that all fingertips come to the stand.
 const STRAIGHT_DOWN_RAD: f64 = 1.4;
 
@@ -31,119 +34,193 @@ const LEAST_BESIDE_M: f64 = 0.015;
 /// Beside the attempts' own: no trial has so many.
 const TARGET_STREAM: u64 = (1 << 20) - 1;
 
-/// Draws attempt number `attempt` of trial number `trial`: a pure function of them, the target and the seed. Approaches
-/// on which the open hand would come to the stand before it touches the target are drawn again: where the stand is, the
-/// arm knows.
+/// Draws attempt number `attempt` of trial number `trial`, or, with a prior, several of them, of which it takes the one whose
+/// lift is most probably kept. Every second blind attempt, from the first on, comes straight down, and the others from
+/// anywhere; all come the one way where the other leads nowhere. A pure function of the arguments.
 ///
 /// # Errors
 /// A hand that cannot be simulated, or a target that it never comes to.
-pub fn draw_start(
+pub fn choose_start(
     hand: &Hand,
     target: &LiftTarget,
     options: &TrialOptions,
+    prior: Option<&ApproachPrior>,
     seed: u64,
     trial: u64,
     attempt: u32,
 ) -> Result<Start, TrialError> {
-    let yaw_rad = yaw_of_trial(seed, trial);
-    let mut rng = stream(seed, trial << 20 | u64::from(attempt));
-    let mechanism = Mechanism::new(hand);
-    let (protocol, range) = (&options.protocol, range(options));
-    if protocol.approach == Approach::Planned {
-        return plan(&mechanism, target, options, &range, yaw_rad, &mut rng);
-    }
-    for _ in 0..MOST_DRAWS {
-        let start = random_start(hand, &range, protocol.least_descent_rad, yaw_rad, &mut rng);
-        if let Some(touch) = first_touch(&mechanism, target, &start)?
-            && stand_distance_m(&mechanism, &start, &touch.palm_from_world, &options.physics)?
-                >= protocol.stand_clearance_m
-        {
-            return Ok(start);
+    let draws = Draws::new(hand, target, options, seed, trial);
+    let mut chosen = draws.in_turn(attempt)?;
+    let Some(prior) = prior else { return Ok(chosen) };
+    let mut best = probability_kept(prior, &chosen);
+    for number in 1..options.protocol.n_approaches {
+        // Attempts have 16 bits.
+        let drawn = draws.in_turn(attempt | number << 16)?;
+        let probability = probability_kept(prior, &drawn);
+        if probability > best {
+            (chosen, best) = (drawn, probability);
         }
     }
-    Err(TrialError::NoApproach { target: target.object.name.clone(), n_draws: MOST_DRAWS })
+    Ok(chosen)
 }
 
-/// Draws an attempt straight down that stops, before it touches if need be, where its fingers can close without coming to the
-/// stand. Attempts whose fingers would close over the target or beside it are drawn again; `None` if all do.
-fn draw_straight_down(
-    hand: &Hand,
-    target: &LiftTarget,
-    options: &TrialOptions,
+/// The attempts of a trial.
+struct Draws<'a> {
+    mechanism: Mechanism<'a>,
+    target: &'a LiftTarget,
+    options: &'a TrialOptions,
+    /// What blind starts are drawn from.
+    range: ProtocolOptions,
     seed: u64,
     trial: u64,
-    attempt: u32,
-) -> Result<Option<Start>, TrialError> {
-    let yaw_rad = yaw_of_trial(seed, trial);
-    let mut rng = stream(seed, trial << 20 | u64::from(attempt));
-    let (mechanism, range) = (Mechanism::new(hand), range(options));
-    let refuse = |error| TrialError::hand(hand, error);
-    let least_descent_rad = options.protocol.least_descent_rad.max(STRAIGHT_DOWN_RAD);
-    for _ in 0..MOST_DRAWS {
-        let mut start = random_start(hand, &range, least_descent_rad, yaw_rad, &mut rng);
-        let Some(touch) = first_touch(&mechanism, target, &start)? else { continue };
-        let world_from_palm = touch.palm_from_world.inverse();
-        let lowest_m = lowest_while_closing_m(&mechanism, &start, &world_from_palm)?;
-        let descent = -(world_from_palm * Vector3::z()).z;
-        start.back_off_m = ((options.protocol.stand_clearance_m - lowest_m) / descent).max(0.0);
-        let mut away_m = start.back_off_m;
-        if away_m > 0.0 {
-            away_m += LEAST_BESIDE_M;
-        }
-        let palm_from_target = Isometry3::translation(0.0, 0.0, away_m) * touch.palm_from_target;
-        let closed = mechanism
-            .close_from(&target.object, palm_from_target, start.open_joints.clone(), &range)
-            .map_err(refuse)?;
-        let posture = closed.posture(closed.end);
-        let is_apart = mechanism
-            .is_apart(&target.object, &closed.palm_from_object, &posture, range.touch_tolerance_m)
-            .map_err(refuse)?;
-        if !is_apart {
-            return Ok(Some(start));
-        }
-    }
-    Ok(None)
-}
-
-/// The target stands as it stood for all attempts of a trial.
-fn yaw_of_trial(seed: u64, trial: u64) -> f64 {
-    std::f64::consts::TAU * stream(seed, trial << 20 | TARGET_STREAM).random::<f64>()
-}
-
-/// What blind starts are drawn from.
-fn range(options: &TrialOptions) -> ProtocolOptions {
-    ProtocolOptions {
-        preshape_range: options.protocol.preshape_range,
-        lateral_offset_m: options.protocol.lateral_offset_m,
-        ..ProtocolOptions::default()
-    }
-}
-
-/// A blind start that descends at least so steeply.
-fn random_start(
-    hand: &Hand,
-    range: &ProtocolOptions,
-    least_descent_rad: f64,
     yaw_rad: f64,
-    rng: &mut ChaCha8Rng,
-) -> Start {
-    let drawn = protocol::draw_start(hand, range, rng);
-    let turn = std::f64::consts::TAU * rng.random::<f64>();
-    let roll = std::f64::consts::TAU * rng.random::<f64>();
-    let least = least_descent_rad.sin();
-    let descent_rad = (least + (1.0 - least) * rng.random::<f64>()).asin();
-    // From level along x: about y down, about z around, about its own axis rolled.
-    let level = UnitQuaternion::from_axis_angle(&Vector3::y_axis(), std::f64::consts::FRAC_PI_2);
-    let down = UnitQuaternion::from_axis_angle(&Vector3::y_axis(), descent_rad);
-    let around = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), turn);
-    let rolled = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), roll);
-    let world_from_palm = around * down * level * rolled;
-    Start {
-        world_from_palm_xyzw: world_from_palm.coords.into(),
-        lateral_offset_m: drawn.lateral_offset_m,
-        open_joints: drawn.open_joints,
-        yaw_rad,
-        back_off_m: 0.0,
+}
+
+impl<'a> Draws<'a> {
+    fn new(hand: &'a Hand, target: &'a LiftTarget, options: &'a TrialOptions, seed: u64, trial: u64) -> Self {
+        let range = ProtocolOptions {
+            preshape_range: options.protocol.preshape_range,
+            lateral_offset_m: options.protocol.lateral_offset_m,
+            ..ProtocolOptions::default()
+        };
+        // The target stands as it stood for all attempts of a trial.
+        let yaw_rad = std::f64::consts::TAU * stream(seed, trial << 20 | TARGET_STREAM).random::<f64>();
+        Draws { mechanism: Mechanism::new(hand), target, options, range, seed, trial, yaw_rad }
+    }
+
+    fn rng(&self, attempt: u32) -> ChaCha8Rng {
+        stream(self.seed, self.trial << 20 | u64::from(attempt))
+    }
+
+    fn in_turn(&self, attempt: u32) -> Result<Start, TrialError> {
+        let found = if self.options.protocol.approach == Approach::Planned {
+            self.planned(attempt)?
+        } else if attempt.is_multiple_of(2) {
+            self.straight_down(attempt)?.map_or_else(|| self.anywhere(attempt), |start| Ok(Some(start)))?
+        } else {
+            self.anywhere(attempt)?.map_or_else(|| self.straight_down(attempt), |start| Ok(Some(start)))?
+        };
+        let target = || self.target.object.name.clone();
+        found.ok_or_else(|| TrialError::NoApproach { target: target(), n_draws: MOST_DRAWS })
+    }
+
+    /// Approaches on which the open hand would come to the stand before it touches the target are drawn again: where the stand
+    /// is, the arm knows.
+    fn anywhere(&self, attempt: u32) -> Result<Option<Start>, TrialError> {
+        let mut rng = self.rng(attempt);
+        for _ in 0..MOST_DRAWS {
+            let start = self.random_start(self.options.protocol.least_descent_rad, &mut rng);
+            if self.first_touch_off_the_stand(&start)?.is_some() {
+                return Ok(Some(start));
+            }
+        }
+        Ok(None)
+    }
+
+    /// The first touch, unless the open hand comes to the stand before.
+    fn first_touch_off_the_stand(&self, start: &Start) -> Result<Option<FirstTouch>, TrialError> {
+        let Some(touch) = first_touch(&self.mechanism, self.target, start)? else { return Ok(None) };
+        let distance_m = stand_distance_m(&self.mechanism, start, &touch.palm_from_world, &self.options.physics)?;
+        Ok((distance_m >= self.options.protocol.stand_clearance_m).then_some(touch))
+    }
+
+    /// An attempt straight down stops, before it touches if need be, where its fingers can close without coming to the stand.
+    /// Attempts whose fingers would close over the target or beside it are drawn again.
+    fn straight_down(&self, attempt: u32) -> Result<Option<Start>, TrialError> {
+        let mut rng = self.rng(attempt);
+        let (mechanism, target, range, protocol) = (&self.mechanism, self.target, &self.range, &self.options.protocol);
+        let refuse = |error| TrialError::hand(mechanism.hand, error);
+        let least_descent_rad = protocol.least_descent_rad.max(STRAIGHT_DOWN_RAD);
+        let top_m = target.hull.compute_aabb(&pose_from_isometry(&world_from_standing(target, self.yaw_rad))).maxs.z;
+        for _ in 0..MOST_DRAWS_STRAIGHT_DOWN {
+            let mut start = self.random_start(least_descent_rad, &mut rng);
+            let Some(touch) = first_touch(mechanism, target, &start)? else { continue };
+            let world_from_palm = touch.palm_from_world.inverse();
+            let lowest_m = lowest_while_closing_m(mechanism, &start, &world_from_palm)?;
+            let descent = -(world_from_palm * Vector3::z()).z;
+            start.back_off_m = ((protocol.stand_clearance_m - lowest_m) / descent).max(0.0);
+            let mut away_m = start.back_off_m;
+            if away_m > 0.0 {
+                away_m += LEAST_BESIDE_M;
+                if top_m < protocol.stand_clearance_m + LEAST_BESIDE_M * descent {
+                    continue;
+                }
+            }
+            let palm_from_target = Isometry3::translation(0.0, 0.0, away_m) * touch.palm_from_target;
+            let closed = mechanism
+                .close_from(&target.object, palm_from_target, start.open_joints.clone(), range)
+                .map_err(refuse)?;
+            let posture = closed.posture(closed.end);
+            let is_apart = mechanism
+                .is_apart(&target.object, &closed.palm_from_object, &posture, range.touch_tolerance_m)
+                .map_err(refuse)?;
+            if !is_apart {
+                return Ok(Some(start));
+            }
+        }
+        Ok(None)
+    }
+
+    /// A blind start that descends at least so steeply.
+    fn random_start(&self, least_descent_rad: f64, rng: &mut ChaCha8Rng) -> Start {
+        let drawn = protocol::draw_start(self.mechanism.hand, &self.range, rng);
+        let turn = std::f64::consts::TAU * rng.random::<f64>();
+        let roll = std::f64::consts::TAU * rng.random::<f64>();
+        let least = least_descent_rad.sin();
+        let descent_rad = (least + (1.0 - least) * rng.random::<f64>()).asin();
+        // From level along x: about y down, about z around, about its own axis rolled.
+        let level = UnitQuaternion::from_axis_angle(&Vector3::y_axis(), std::f64::consts::FRAC_PI_2);
+        let down = UnitQuaternion::from_axis_angle(&Vector3::y_axis(), descent_rad);
+        let around = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), turn);
+        let rolled = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), roll);
+        let world_from_palm = around * down * level * rolled;
+        Start {
+            world_from_palm_xyzw: world_from_palm.coords.into(),
+            lateral_offset_m: drawn.lateral_offset_m,
+            open_joints: drawn.open_joints,
+            yaw_rad: self.yaw_rad,
+            back_off_m: 0.0,
+        }
+    }
+
+    /// The planned approach of least energy of those that come from above and pass the stand. The planner's energy is that of
+    /// the hand closed on an object that stays where it is.
+    fn planned(&self, attempt: u32) -> Result<Option<Start>, TrialError> {
+        let mut rng = self.rng(attempt);
+        let (mechanism, target, range) = (&self.mechanism, self.target, &self.range);
+        let (protocol, planner) = (&self.options.protocol, &self.options.planner);
+        let world_from_target = world_from_standing(target, self.yaw_rad);
+        let approaches = Approaches::new(mechanism.hand, &target.object, range, planner);
+        let mut best: Option<(f64, Start)> = None;
+        let mut n_found = 0;
+        for _ in 0..MOST_DRAWS.max(8 * planner.n_approaches) {
+            let drawn = approaches.draw(&mut rng);
+            let world_from_palm = world_from_target.rotation * drawn.palm_from_object_rotation.inverse();
+            if -(world_from_palm * Vector3::z()).z < protocol.least_descent_rad.sin() {
+                continue;
+            }
+            let start = Start {
+                world_from_palm_xyzw: world_from_palm.coords.into(),
+                lateral_offset_m: drawn.lateral_offset_m,
+                open_joints: drawn.open_joints.clone(),
+                yaw_rad: self.yaw_rad,
+                back_off_m: 0.0,
+            };
+            let Some(touch) = self.first_touch_off_the_stand(&start)? else { continue };
+            let explored =
+                mechanism.close_from(&target.object, touch.palm_from_target, start.open_joints.clone(), range);
+            let exploration = explored.map_err(|error| TrialError::hand(mechanism.hand, error))?;
+            let energy = energy(mechanism.hand, &target.object, &exploration, planner);
+            let energy = energy.map_err(|error| TrialError::hand(mechanism.hand, error))?;
+            if best.as_ref().is_none_or(|(least, _)| energy < *least) {
+                best = Some((energy, start));
+            }
+            n_found += 1;
+            if n_found == planner.n_approaches {
+                break;
+            }
+        }
+        Ok(best.map(|(_, start)| start))
     }
 }
 
@@ -169,106 +246,6 @@ fn lowest_while_closing_m(
     Ok(lowest_m)
 }
 
-/// The planned approach of least energy of those that come from above and pass the stand. The planner's energy is that of
-/// the hand closed on an object that stays where it is.
-fn plan(
-    mechanism: &Mechanism<'_>,
-    target: &LiftTarget,
-    options: &TrialOptions,
-    range: &ProtocolOptions,
-    yaw_rad: f64,
-    rng: &mut ChaCha8Rng,
-) -> Result<Start, TrialError> {
-    let (protocol, planner) = (&options.protocol, &options.planner);
-    let world_from_target = world_from_standing(target, yaw_rad);
-    let approaches = Approaches::new(mechanism.hand, &target.object, range, planner);
-    let mut best: Option<(f64, Start)> = None;
-    let mut n_found = 0;
-    for _ in 0..MOST_DRAWS.max(8 * planner.n_approaches) {
-        let drawn = approaches.draw(rng);
-        let world_from_palm = world_from_target.rotation * drawn.palm_from_object_rotation.inverse();
-        if -(world_from_palm * Vector3::z()).z < protocol.least_descent_rad.sin() {
-            continue;
-        }
-        let start = Start {
-            world_from_palm_xyzw: world_from_palm.coords.into(),
-            lateral_offset_m: drawn.lateral_offset_m,
-            open_joints: drawn.open_joints.clone(),
-            yaw_rad,
-            back_off_m: 0.0,
-        };
-        let Some(touch) = first_touch(mechanism, target, &start)? else { continue };
-        if stand_distance_m(mechanism, &start, &touch.palm_from_world, &options.physics)? < protocol.stand_clearance_m {
-            continue;
-        }
-        let explored = mechanism.close_from(&target.object, touch.palm_from_target, start.open_joints.clone(), range);
-        let exploration = explored.map_err(|error| TrialError::hand(mechanism.hand, error))?;
-        let energy = energy(mechanism.hand, &target.object, &exploration, planner);
-        let energy = energy.map_err(|error| TrialError::hand(mechanism.hand, error))?;
-        if best.as_ref().is_none_or(|(least, _)| energy < *least) {
-            best = Some((energy, start));
-        }
-        n_found += 1;
-        if n_found == planner.n_approaches {
-            break;
-        }
-    }
-    match best {
-        Some((_, start)) => Ok(start),
-        None => Err(TrialError::NoApproach { target: target.object.name.clone(), n_draws: MOST_DRAWS }),
-    }
-}
-
-/// Draws attempt number `attempt` of trial number `trial`, or, with a prior, several of them, of which it takes the one whose
-/// lift is most probably kept. Every second blind attempt, from the first on, comes straight down, and the others as those of
-/// [`draw_start`]; all come the one way where the other leads nowhere.
-///
-/// # Errors
-/// As of [`draw_start`].
-pub fn choose_start(
-    hand: &Hand,
-    target: &LiftTarget,
-    options: &TrialOptions,
-    prior: Option<&ApproachPrior>,
-    seed: u64,
-    trial: u64,
-    attempt: u32,
-) -> Result<Start, TrialError> {
-    let mut chosen = draw_in_turn(hand, target, options, seed, trial, attempt)?;
-    let Some(prior) = prior else { return Ok(chosen) };
-    let mut best = probability_kept(prior, &chosen);
-    for number in 1..options.protocol.n_approaches {
-        // Attempts have 16 bits.
-        let drawn = draw_in_turn(hand, target, options, seed, trial, attempt | number << 16)?;
-        let probability = probability_kept(prior, &drawn);
-        if probability > best {
-            (chosen, best) = (drawn, probability);
-        }
-    }
-    Ok(chosen)
-}
-
-fn draw_in_turn(
-    hand: &Hand,
-    target: &LiftTarget,
-    options: &TrialOptions,
-    seed: u64,
-    trial: u64,
-    attempt: u32,
-) -> Result<Start, TrialError> {
-    let is_blind = options.protocol.approach == Approach::Blind;
-    let is_straight_down = is_blind && attempt.is_multiple_of(2);
-    if is_straight_down && let Some(start) = draw_straight_down(hand, target, options, seed, trial, attempt)? {
-        return Ok(start);
-    }
-    match draw_start(hand, target, options, seed, trial, attempt) {
-        Err(missed @ TrialError::NoApproach { .. }) if is_blind && !is_straight_down => {
-            draw_straight_down(hand, target, options, seed, trial, attempt)?.ok_or(missed)
-        }
-        drawn => drawn,
-    }
-}
-
 fn probability_kept(prior: &ApproachPrior, start: &Start) -> f64 {
     let world_from_palm = UnitQuaternion::from_quaternion(nalgebra::Quaternion::from(start.world_from_palm_xyzw));
     let down = world_from_palm.inverse() * -Vector3::z();
@@ -278,7 +255,7 @@ fn probability_kept(prior: &ApproachPrior, start: &Start) -> f64 {
 /// The seed of the sensor's noise in attempt number `attempt` of trial number `trial`: a pure function of them and the
 /// seed.
 pub fn sensor_seed(seed: u64, trial: u64, attempt: u32) -> u64 {
-    // Beside the streams that `draw_start` draws from.
+    // Beside the streams that attempts are drawn from.
     stream(seed, 1 << 63 | trial << 20 | u64::from(attempt)).random()
 }
 
@@ -360,8 +337,8 @@ mod tests {
         let hand = Hand::load(std::path::Path::new("barrett-bh8-280")).expect("built in");
         let options = TrialOptions::default();
         let low = targets_named("ball-07,can-06,spoon-00").expect("43, 34 and 9 mm high");
-        let from_anywhere = draw_start(&hand, &low[0], &options, 3, 0, 0);
-        assert!(matches!(from_anywhere, Err(TrialError::NoApproach { .. })), "{from_anywhere:?}");
+        let from_anywhere = Draws::new(&hand, &low[0], &options, 3, 0).anywhere(0).expect("a hand");
+        assert_eq!(from_anywhere, None);
         let starts =
             [0, 1].map(|attempt| choose_start(&hand, &low[0], &options, None, 3, 0, attempt).expect("a start"));
         assert!(starts.iter().all(|start| start.back_off_m > 0.05), "{starts:?}");
@@ -386,6 +363,6 @@ mod tests {
         assert!((world_from_palm * Vector3::z()).z < -0.98, "{start:?}");
         assert_eq!(start.back_off_m, 0.0);
         let second = choose_start(&hand, &canteen, &options, None, 3, 0, 1).expect("a start");
-        assert_eq!(second, draw_start(&hand, &canteen, &options, 3, 0, 1).expect("a start"));
+        assert_eq!(Ok(Some(second)), Draws::new(&hand, &canteen, &options, 3, 0).anywhere(1));
     }
 }
