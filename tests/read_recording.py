@@ -38,11 +38,7 @@ def words_of(definition):
 def fields_of(message):
     """The names and values of a decoded message's fields, whichever reader decoded it."""
     names = getattr(message, "__slots__", None) or vars(message)
-    found = {name: getattr(message, name) for name in names if not name.startswith("_")}
-    # Earlier versions named a field so that rosbags, as it is reserved in Python, appends an underscore.
-    for earlier in {"class", "class_"} & set(found):
-        found["object_class"] = found.pop(earlier)
-    return found
+    return {name: getattr(message, name) for name in names if not name.startswith("_")}
 
 
 class Comparison:

@@ -43,6 +43,11 @@ def exported(path, *topics):
     return list(map(json.loads, subprocess.run(command, stdout=subprocess.PIPE, check=True).stdout.splitlines()))
 
 
+def fields(definition):
+    """The lines of a ROS 2 message without comments."""
+    return [line.split("#")[0].split() for line in definition.splitlines() if line.split("#")[0].strip()]
+
+
 def unique_name():
     return f"python-{os.getpid()}-{os.urandom(4).hex()}"
 
@@ -98,13 +103,38 @@ class Recordings(Folder):
         self.assertEqual((grasps[0].label.object_id, grasps[0].label.object_class), ("vase-20", "vase"))
         self.assertIsNone(grasps[0].decision)
 
-    def test_recordings_of_graphs_faults_and_earlier_versions_are_read(self):
+    def test_recordings_of_graphs_and_faults_are_read_and_have_the_messages_of_the_package(self):
         paths = sorted((REPOSITORY / "recordings").glob("*.mcap"))
         self.assertGreater(len(paths), 5)
         for path in paths:
             with self.subTest(path.name):
                 if path != HELD_OUT:
                     self.assertTrue(all(grasp.decision for grasp in self.compare(path)))
+                with open(path, "rb") as stream:
+                    schemas = make_reader(stream).get_summary().schemas.values()
+                for schema in schemas:
+                    package, _, name = schema.name.split("/")
+                    message = REPOSITORY / "examples" / package / "msg" / f"{name}.msg"
+                    definition = schema.data.decode().split("=====")[0]
+                    self.assertEqual(fields(definition), fields(message.read_text()), schema.name)
+
+    def test_a_recording_of_an_earlier_version_is_read(self):
+        earlier = self.folder / "earlier.mcap"
+        with open(ORDINARY, "rb") as stream, open(earlier, "wb") as target:
+            reader, writer = make_reader(stream), Writer(target)
+            writer.start()
+            for metadata in reader.iter_metadata():
+                writer.add_metadata(metadata.name, metadata.metadata)
+            channels = {}
+            for schema, channel, message in reader.iter_messages(log_time_order=False):
+                if channel.id not in channels:
+                    definition = schema.data.replace(b"string object_class\n", b"string class\n")
+                    of = writer.register_schema(schema.name, schema.encoding, definition)
+                    channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, of)
+                of = channels[channel.id]
+                writer.add_message(of, message.log_time, message.data, message.publish_time, message.sequence)
+            writer.finish()
+        self.assertNotEqual(self.compare(earlier)[0].label.object_class, "")
 
     def test_frames_that_lack_cells_end_with_nan(self):
         grasps = blindgrasp.read(REPOSITORY / "recordings/drop-outs.mcap")
