@@ -14,7 +14,6 @@ The first run simulates the grasps. `positions` is a file of little-endian doubl
 
 import json
 import os
-import statistics
 import subprocess
 import sys
 import time

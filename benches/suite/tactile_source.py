@@ -13,7 +13,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from . import figures, graphs, programs
+from . import graphs, programs
 from .options import Option
 
 OPTIONS = {

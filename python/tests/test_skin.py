@@ -133,7 +133,7 @@ class Skin(unittest.TestCase):
         with self.assertRaisesRegex(ValueError, "links names 'palm', which has no cells: expected any of 'left_jaw'"):
             blindgrasp.skin(model, GRIPPER, {"palm": "palm"})
         # The jaw hangs on another body, whose frame a site corrects; its shape is on a body that is fixed to that one.
-        moved = f"""<mujoco><worldbody><body pos="0.3 0 0"><joint type="slide"/>
+        moved = """<mujoco><worldbody><body pos="0.3 0 0"><joint type="slide"/>
             <body name="left_jaw" pos="0 0 0.5"><site name="frame" pos="0 0 -0.5"/>
             <body><geom type="box" size="0.011 0.006 0.029" pos="0 0.006 -0.469"/></body></body></body>
             <body name="right_jaw"><geom type="box" size="0.011 0.006 0.029" pos="0 -0.006 0.031"/></body>
@@ -147,8 +147,6 @@ class Skin(unittest.TestCase):
         self.assertTrue(np.all(cells[:12] > 0.0) and np.all(cells[12:] == 0.0), cells)
 
     def test_readings_differ_from_forces_only_as_asked(self):
-        import mujoco
-
         model, data = squeezed()
         exact = blindgrasp.skin(model, GRIPPER).forces(data)
 
