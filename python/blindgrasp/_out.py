@@ -94,8 +94,9 @@ def to_lerobot(
     """Writes recordings to a new folder as a LeRobot dataset of format v3.0, an episode for each grasp.
 
     `recordings` and `hand` are those of `to_parquet`. Features are `observation.state` (the joints), `observation.tactile`
-    (the cells), other senses like `observation.gravity_m_per_s2`, `phase`, `stamp_nanos` and `predicted`. The task is the
-    object's name. What is known of the grasp is in the fields of its episode (meta/episodes). `timestamp` has the whole
+    (the cells), other senses like `observation.gravity_m_per_s2`, `phase`, `stamp_nanos`, `predicted` and `stable` (`true`,
+    `false`, or nothing without a label). The task is the object's name. What else is known of the grasp is in the fields of its
+    episode (meta/episodes), which LeRobot's own splits drop. `timestamp` has the whole
     number of frames a second that is nearest to the first grasp's. `python3 -P -m blindgrasp.lerobot` reads the dataset
     back with `--cells observation.tactile --joints observation.state --label stable --phase phase`.
 
@@ -212,7 +213,7 @@ class _LeRobot:
         named = {"joint": "observation.state", "cell": "observation.tactile"}
         self.feature_of = {sense: named.get(sense, f"observation.{sense}") for sense, width in data.widths.items() if width}
         shapes = {name: (data.widths[sense], "float64") for sense, name in self.feature_of.items()}
-        shapes |= {"phase": (1, "string"), "stamp_nanos": (1, "int64"), "predicted": (1, "float64"), "timestamp": (1, "float32")}
+        shapes |= {"phase": (1, "string"), "stable": (1, "string"), "stamp_nanos": (1, "int64"), "predicted": (1, "float64"), "timestamp": (1, "float32")}
         shapes |= {name: (1, "int64") for name in ("frame_index", "episode_index", "index", "task_index")}
         self.features = {name: {"dtype": kind, "shape": [n], "names": None} for name, (n, kind) in shapes.items()}
         for sense, name in self.feature_of.items():
@@ -273,6 +274,7 @@ class _LeRobot:
             frames = np.arange(n)
             columns: dict[str, Any] = {
                 "phase": grasp.phase.tolist(),
+                "stable": [{True: "true", False: "false"}.get(known["stable"], "")] * n,
                 "stamp_nanos": grasp.stamp_nanos,
                 "predicted": grasp.probability_stable,
                 "timestamp": (frames / (self.data.frames_per_second or 1)).astype(np.float32),
