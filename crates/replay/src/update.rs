@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::iter::Peekable;
 use std::path::Path;
 
-use serde_json::Value;
+use serde_json::{Map, Value};
 
 use super::comparison::Coverage;
 use super::played::is_played;
@@ -26,10 +26,10 @@ pub enum UpdateError {
     OtherTopic { topic: String, schema: String },
 }
 
-/// Writes the recording anew and says what it wrote. The edges of the replay take the place of the recorded ones, and so do
-/// parameters, versions and models of the nodes that ran, if the recording says which it had. The played topic, labels, scenes,
-/// other metadata and attachments, and the edges of stages that did not run stay. Topics for viewers are
-/// made again if the files of the recording's hand are attached: then this library has written them.
+/// Writes the recording anew and says what it wrote. The edges of the replay take the place of the recorded ones. If the recording
+/// has metadata about its graph, the programs, parameters, versions and models of the nodes that ran become those of the replay. The
+/// played topic, labels, scenes, all other metadata and attachments, and the edges of stages that did not run stay. Topics for viewers
+/// are made again if the files of the recording's hand are attached: then this library has written them.
 ///
 /// # Errors
 /// See [`UpdateError`].
@@ -61,10 +61,9 @@ pub fn update(
     let replay = RecordingReader::open(found)?;
     let mut metadata = reader.all_metadata().clone();
     if let (Some(about), Some(of_replay)) = (metadata.get_mut(GRAPH_METADATA), replay.metadata(GRAPH_METADATA)) {
-        let has_run = update_graph(about, of_replay);
-        attachments.retain(|file| !has_run.iter().any(|node| file.name == attached_model(node)));
-        let files = self::attachments(found)?.into_iter();
-        attachments.extend(files.filter(|file| has_run.iter().any(|node| file.name == attached_model(node))));
+        let files: BTreeSet<String> = update_graph(about, of_replay).iter().map(|node| attached_model(node)).collect();
+        attachments.retain(|file| !files.contains(&file.name));
+        attachments.extend(self::attachments(found)?.into_iter().filter(|file| files.contains(&file.name)));
     }
     let mut new_samples = replay
         .filter_map(|record| match record {
@@ -88,31 +87,39 @@ pub fn update(
     Ok(format!("updated: {}", written.join(", ")))
 }
 
-/// Gives the nodes that ran in the replay the parameters, versions and models that they had there, and returns their names. The
-/// sources did not run: the replay has its own.
+/// Gives the nodes that ran in the replay the programs, parameters, versions and models that they had there, and returns their names.
+/// The replay plays the recorded sources, which stay as they are.
 fn update_graph(about: &mut BTreeMap<String, String>, of_replay: &BTreeMap<String, String>) -> Vec<String> {
-    let read = |from: &BTreeMap<String, String>, key: &str| -> Value {
+    let read = |from: &BTreeMap<String, String>, key: &str| -> Map<String, Value> {
         from.get(key).and_then(|text| serde_json::from_str(text).ok()).unwrap_or_default()
     };
-    let mut graph = read(about, "graph");
-    let ran = read(of_replay, "graph");
-    let mut has_run = Vec::new();
-    for node in graph["nodes"].as_array_mut().into_iter().flatten() {
-        let same = ran["nodes"].as_array().into_iter().flatten().find(|other| other["id"] == node["id"]);
-        if let Some(same) = same.filter(|same| same["inputs"].as_array().is_some_and(|inputs| !inputs.is_empty())) {
-            has_run.extend(same["id"].as_str().map(String::from));
-            *node = same.clone();
+    let (mut graph, replay) = (read(about, "graph"), read(of_replay, "graph"));
+    let (Some(nodes), Some(replayed)) =
+        (graph.get_mut("nodes").and_then(Value::as_array_mut), replay.get("nodes").and_then(Value::as_array))
+    else {
+        return Vec::new();
+    };
+    let mut nodes_that_ran = Vec::new();
+    for node in nodes {
+        let same = replayed.iter().find(|other| other["id"] == node["id"]);
+        let Some(same) = same.filter(|same| same["inputs"].as_array().is_some_and(|inputs| !inputs.is_empty())) else {
+            continue;
+        };
+        nodes_that_ran.extend(same["id"].as_str().map(String::from));
+        for key in ["operator", "version", "program", "args", "params"] {
+            node[key] = same[key].clone();
         }
     }
-    about.insert("graph".into(), graph.to_string());
+    about.insert("graph".into(), Value::Object(graph).to_string());
     for key in ["models", "operator_versions"] {
-        let (mut all, new) = (read(about, key), read(of_replay, key));
-        for node in &has_run {
-            all[node] = new[node].clone();
+        let (mut all, mut new) = (read(about, key), read(of_replay, key));
+        for node in &nodes_that_ran {
+            all.remove(node);
+            all.extend(new.remove_entry(node));
         }
-        about.insert(key.into(), all.to_string());
+        about.insert(key.into(), Value::Object(all).to_string());
     }
-    has_run
+    nodes_that_ran
 }
 
 /// Begins the new recording with this metadata and these attachments.
@@ -196,8 +203,9 @@ mod tests {
         let record = |name: &str, source: &str, model: &str| {
             let path = folder.path().join(name);
             let info = RecordingInfo { hand: "h".into(), hand_id: 1, made_by: "a test".into(), version: "0".into() };
-            let node = |id: &str, inputs: Value| json!({"id": id, "params": {"model": model}, "inputs": inputs});
-            let graph = json!({"nodes": [node(source, json!([])), node("classifier", json!([{"port": "feature"}]))]});
+            let node = |id: &str, from: &[&str]| json!({"id": id, "params": {"model": model}, "inputs": from});
+            let nodes = [node(source, &[]), node("classifier", &[source]), node("lift_arbiter", &["classifier"])];
+            let graph = json!({ "nodes": nodes });
             let models = json!({"classifier": model});
             let about = [("graph", graph), ("models", models)].map(|(key, value)| (key.to_string(), value.to_string()));
             let files = [("notes.txt", name), ("model of classifier.json", model)];
@@ -216,13 +224,9 @@ mod tests {
         let reader = RecordingReader::open(&path).expect("opened");
         let about = reader.metadata(GRAPH_METADATA).expect("there");
         let graph: Value = serde_json::from_str(&about["graph"]).expect("JSON");
-        let params: Vec<_> = graph["nodes"]
-            .as_array()
-            .expect("nodes")
-            .iter()
-            .map(|node| (&node["id"], &node["params"]["model"]))
-            .collect();
-        assert_eq!(params, [(&json!("hand"), &json!("old")), (&json!("classifier"), &json!("new"))]);
+        let models = [0, 1, 2].map(|idx| graph["nodes"][idx]["params"]["model"].as_str().expect("a path"));
+        assert_eq!(models, ["old", "new", "new"]);
+        assert_eq!(graph["nodes"][1]["inputs"], json!(["hand"]), "the recorded edge");
         assert_eq!(about["models"], r#"{"classifier":"new"}"#);
         let mut files: Vec<_> =
             attachments(&path).expect("read").into_iter().map(|file| (file.name, file.data)).collect();
