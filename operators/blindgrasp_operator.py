@@ -165,7 +165,7 @@ class Stage:
     """Called with the new values of live parameters before `start`'s params are updated; an exception refuses them."""
     state: Callable[[], bytes] | None = None
     """With state: the bytes on which the next answer depends, saved after each sample. With the answers that readers may still
-    need, they may take 64 KiB. With `answers_each=False`, `answer` may return None, and with one input and one output give a
+    need, they may take 256 KiB. With `answers_each=False`, `answer` may return None, and with one input and one output give a
     header of its own; without one the answer gets that of the sample."""
     restore: Callable[[bytes | None], None] | None = None
     """With state: takes over the bytes that `state` returned, here or in another process, or begins anew."""
@@ -209,7 +209,7 @@ class Source:
     last sample of each output that readers have, or None, and `next` goes on with that sample or any before it."""
     state: Callable[[], bytes] | None = None
     """Without `resume`: the bytes on which the next sample depends, saved with each sample. With the samples that readers may
-    still need, they may take 64 KiB."""
+    still need, they may take 256 KiB."""
     restore: Callable[[bytes | None], None] | None = None
     """Takes over the bytes that `state` returned, here or in another process, or begins anew."""
     receive: Callable[[str, Any, Any], None] | None = None

@@ -45,7 +45,7 @@ pub const COMPARE_BELL: usize = 1;
 /// The number of slots with bells of commands. The slots of nodes and ports follow.
 pub const N_COMMAND_BELLS: usize = 2;
 /// The largest state of a node.
-pub const STATE_BYTES: usize = 64 << 10;
+pub const STATE_BYTES: usize = 256 << 10;
 /// A state region: the number of the valid half, the length of each half, the halves.
 const REGION_BYTES: usize = 4096 + 2 * STATE_BYTES;
 

@@ -13,8 +13,9 @@ use crate::contacts::are_forces;
 use crate::hand::Hand;
 use blindgrasp_messages::Phase;
 
-/// The most cells of a hand whose readings are filtered: the filter keeps two numbers of each, and a node saves 64 KiB.
-pub const MAX_FILTERED_CELLS: usize = 4000;
+/// The most cells of a hand whose readings are filtered. A node saves 256 KiB, and a cell that feels takes 64 bytes of an answer, 16
+/// of this filter and 24 of the watch for faulty sensors.
+pub const MAX_FILTERED_CELLS: usize = 2000;
 
 /// A spike is so many noise thresholds high. A load at the threshold goes to and fro about it.
 const SPIKE_THRESHOLDS: f64 = 3.0;

@@ -559,6 +559,13 @@ mod tests {
         assert_eq!((hand.n_cells(), hand.noise_thresholds_newtons()), (MAX_CELLS, &[0.1; MAX_CELLS][..]));
         let error = hand_of(MAX_CELLS + 1).expect_err("too many").to_string();
         assert!(error.contains("16385 cells, expected 1 to 16384"), "{error}");
+        let filtered = |n_cells| {
+            let text = format!("{}\nmedian_filter: true\n", text_of(n_cells));
+            Hand::parse(Path::new("skin.yaml"), &text, |_| Ok(urdf.into()))
+        };
+        assert!(filtered(MAX_FILTERED_CELLS).expect("a hand").median_filter);
+        let error = filtered(MAX_FILTERED_CELLS + 1).expect_err("too many").to_string();
+        assert!(error.contains("median_filter is for at most 2000 cells, and the hand has 2001"), "{error}");
     }
 
     #[test]
