@@ -9,7 +9,7 @@ use anyhow::Context;
 use clap::Args;
 use serde_json::json;
 
-use super::{Outcome, check_new, data_on_stdout, print_line};
+use super::{Outcome, check_new, completions, data_on_stdout, print_line};
 use blindgrasp_cli::shard::Shard;
 use blindgrasp_grasps::dataset::hand_of;
 use blindgrasp_grasps::feature_table::{FeatureTableError, write_feature_table};
@@ -48,7 +48,7 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "I/N", requires = "features")]
     shard: Option<Shard>,
     /// Pad layout of the hand, for --features; default: the built-in hand that the first recording names.
-    #[arg(long, requires = "features")]
+    #[arg(long, requires = "features", add = completions::hands())]
     hand: Option<PathBuf>,
 }
 

@@ -31,7 +31,7 @@ const MAX_READ_BYTES: u64 = 256 << 20;
 )]
 pub(super) struct Arguments {
     /// Recordings (MCAP) or folders of them; or one pad layout: a YAML file, or the name of a built-in hand
-    #[arg(required = true)]
+    #[arg(required = true, add = completions::hands())]
     recordings: Vec<PathBuf>,
     /// Pad layout of the hand; default: the built-in hand that the first recording names.
     #[arg(long, add = completions::hands())]

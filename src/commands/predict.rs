@@ -6,7 +6,7 @@ use anyhow::Context;
 use clap::{Args, ValueEnum};
 use serde_json::json;
 
-use super::{Outcome, print_line};
+use super::{Outcome, completions, print_line};
 use blindgrasp_cli::frame_lines::read_frames;
 use blindgrasp_cli::shard::Shard;
 use blindgrasp_grasps::dataset::hand_of;
@@ -32,7 +32,7 @@ pub(super) struct Arguments {
     #[arg(required = true, value_name = "FILE")]
     files: Vec<PathBuf>,
     /// Pad layout of the hand [default: the built-in hand of the model]
-    #[arg(long)]
+    #[arg(long, add = completions::hands())]
     hand: Option<PathBuf>,
     /// The probe whose frames decide, for a model that was trained on lifts: those of the settled hand, of the tight hand, or
     /// those after the test lift

@@ -8,7 +8,8 @@ use indicatif::{ProgressBar, ProgressStyle};
 
 use super::model::{curve_lines, own_threshold};
 use super::{
-    Outcome, check_output, check_page, number_in, percent, print_line, print_text, word, write_out, write_report,
+    Outcome, check_output, check_page, completions, number_in, percent, print_line, print_text, word, write_out,
+    write_report,
 };
 use blindgrasp_grasps::dataset::{hand_of, label_line, labels_of};
 use blindgrasp_learning::evaluation::baselines::Baselines;
@@ -89,7 +90,7 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "ATTEMPTS", conflicts_with_all = ["split", "json"], value_parser = |text: &str| number_in(text, 0.0..=1e6))]
     drop_costs: Option<f64>,
     /// Pad layout of the hand; default: the built-in hand that the first recording names.
-    #[arg(long)]
+    #[arg(long, add = completions::hands())]
     hand: Option<PathBuf>,
     /// Print JSON, with every number of the report.
     #[arg(long)]

@@ -11,7 +11,7 @@ use serde_json::json;
 
 use super::evaluate::command_line;
 use super::simulate::complete_folder;
-use super::{Outcome, number_in, percent, print_line, print_text, word, write_out, write_report};
+use super::{Outcome, completions, number_in, percent, print_line, print_text, word, write_out, write_report};
 use blindgrasp_cli::graph_file::{OnMisfit, able_to_begin};
 use blindgrasp_cli::{in_shell, stop_signal};
 use blindgrasp_graph::dataflow::{self, Override, Scope};
@@ -69,6 +69,7 @@ const REPORT: &str = "report.html";
                   blindgrasp learn my_hand/my_hand.yaml --max-drops 0.05 --lifts 16000")]
 pub(super) struct Arguments {
     /// Pad layout (YAML) of the hand.
+    #[arg(add = completions::hands())]
     hand: PathBuf,
     /// The most lifts: 500 come first, and then as many as there are, again and again.
     #[arg(long, default_value_t = 8000, value_parser = clap::value_parser!(u64).range(FIRST_LIFTS as u64..=1_000_000))]

@@ -15,7 +15,7 @@ use blindgrasp_graph::client::is_graph_name;
 use blindgrasp_graph::dataflow::Override;
 use clap::{Args, ValueEnum};
 
-use super::Outcome;
+use super::{Outcome, completions};
 use blindgrasp_cli::joint;
 
 /// Show a graph or recording in a browser; draw a grasp or a hand.
@@ -111,7 +111,7 @@ struct GraspArguments {
     #[arg(long)]
     grasp: Option<u64>,
     /// Pad layout of the hand [default: the built-in hand that the recording names]
-    #[arg(long)]
+    #[arg(long, add = completions::hands())]
     hand: Option<PathBuf>,
     /// Folder of the objects' meshes [default: the built-in objects]
     #[arg(long)]
