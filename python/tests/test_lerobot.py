@@ -209,15 +209,19 @@ class LeRobot(unittest.TestCase):
         stats = json.loads((root / "meta/stats.json").read_text())["observation.tactile"]
         for name, expected in (("mean", cells.mean(axis=0)), ("std", cells.std(axis=0)), ("max", cells.max(axis=0))):
             np.testing.assert_allclose(stats[name], expected, atol=1e-9)
-        # LeRobot's own splits drop it there.
-        episodes.drop(columns="stable").to_parquet(root / "meta/episodes/chunk-000/file-000.parquet")
         words = ["--hand", "barrett-bh8-280", "--joints", "observation.state", "--joint-scale", "1", "--phase", "phase"]
-        done = self.converted(root, *words, "--class", "object_class", cells="observation.tactile", label="stable")
+        words += ["--class", "object_class"]
+        done = self.converted(root, *words, cells="observation.tactile", label="stable")
         for grasp, again in zip(grasps, self.imported(done), strict=True):
             for name in ("joints", "cells_newtons", "phase"):
                 np.testing.assert_array_equal(getattr(again, name), getattr(grasp, name))
             names = ("is_stable", "object_id", "object_class")
             self.assertEqual([getattr(again.label, name) for name in names], [getattr(grasp.label, name) for name in names])
+        # LeRobot's own splits drop the fields of episodes.
+        episodes.drop(columns="stable").to_parquet(root / "meta/episodes/chunk-000/file-000.parquet")
+        before = self.table.read_text(encoding="utf-8")
+        self.converted(root, *words, "--overwrite", cells="observation.tactile", label="stable")
+        self.assertEqual(self.table.read_text(encoding="utf-8"), before)
         with self.assertRaises(FileExistsError):
             blindgrasp.to_lerobot(recordings, root)
 

@@ -125,15 +125,17 @@ class Recordings(Folder):
             writer.start()
             for metadata in reader.iter_metadata():
                 writer.add_metadata(metadata.name, metadata.metadata)
-            channels = {}
+            channels, n_renamed = {}, 0
             for schema, channel, message in reader.iter_messages(log_time_order=False):
                 if channel.id not in channels:
                     definition = schema.data.replace(b"string object_class\n", b"string class\n")
+                    n_renamed += definition != schema.data
                     of = writer.register_schema(schema.name, schema.encoding, definition)
                     channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, of)
                 of = channels[channel.id]
                 writer.add_message(of, message.log_time, message.data, message.publish_time, message.sequence)
             writer.finish()
+        self.assertEqual(n_renamed, 1)
         self.assertNotEqual(self.compare(earlier)[0].label.object_class, "")
 
     def test_frames_that_lack_cells_end_with_nan(self):
