@@ -153,7 +153,7 @@ impl<'a> Attempt<'a> {
         check_hand(hand).map_err(|error| TrialError::hand(hand, error))?;
         let mechanism = Mechanism::new(hand);
         let Some(touch) = first_touch(&mechanism, target, start)? else {
-            return Err(TrialError::NoApproach { target: target.object.name.clone(), n_draws: 1 });
+            return Err(TrialError::NoApproach { target: target.object.name.clone() });
         };
         let mut stand_off_m = options.protocol.stand_off_m;
         if start.back_off_m > 0.0 {

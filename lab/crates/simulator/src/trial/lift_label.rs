@@ -43,7 +43,7 @@ pub(crate) fn try_candidate(
     let target = varied(&objects[object_idx], options, &mut rng);
     let start_seed = rng.random();
     let trial_options = trial_options(options, &mut rng);
-    // Every second candidate comes as the first attempt of a trial does, and the others as the second.
+    // As in a trial, every second attempt comes straight down.
     let begun = choose_start(hand, &target, &trial_options, None, start_seed, 0, (candidate % 2) as u32)
         .and_then(|start| Attempt::begin(hand, &target, &trial_options, &start, 0));
     let attempt = match begun {

@@ -84,10 +84,10 @@ pub enum TrialError {
     #[error("options {}: {reason}", path.display())]
     OptionsFile { path: PathBuf, reason: String },
     #[error(
-        "{target}: none of {n_draws} approaches leads the open hand to it without touching the stand before; expected an \
+        "{target}: no approach leads the open hand to it without touching the stand before; expected an \
          object that stands higher or is larger: leave it out"
     )]
-    NoApproach { target: String, n_draws: usize },
+    NoApproach { target: String },
     /// The hand cannot be simulated.
     #[error("hand {hand}: {reason}")]
     Hand { hand: String, reason: String },

@@ -18,7 +18,8 @@ use blindgrasp_stages::hand::{Hand, pose_from_isometry};
 /// Most approaches that are drawn before the target is given up. Most approaches are possible.
 const MOST_DRAWS: usize = 1000;
 
-/// Most approaches straight down that are drawn: over a flat target all of them fail, and most of the others do not.
+/// Most approaches straight down that are drawn. Over a flat target each of them fails, over most other targets one of the first few
+/// does not.
 const MOST_DRAWS_STRAIGHT_DOWN: usize = 200;
 
 /// Least descent of an approach straight down, from level: 10° from the vertical, so that all fingertips come to the stand.
@@ -50,18 +51,17 @@ pub fn choose_start(
     attempt: u32,
 ) -> Result<Start, TrialError> {
     let draws = Draws::new(hand, target, options, seed, trial);
-    let mut chosen = draws.in_turn(attempt)?;
-    let Some(prior) = prior else { return Ok(chosen) };
-    let mut best = probability_kept(prior, &chosen);
-    for number in 1..options.protocol.n_approaches {
+    let n_draws = if prior.is_some() { options.protocol.n_approaches } else { 1 };
+    let mut best: Option<(f64, Start)> = None;
+    for number in 0..n_draws {
         // Attempts have 16 bits.
-        let drawn = draws.in_turn(attempt | number << 16)?;
-        let probability = probability_kept(prior, &drawn);
-        if probability > best {
-            (chosen, best) = (drawn, probability);
+        let Some(start) = draws.in_turn(attempt | number << 16)? else { continue };
+        let probability = prior.map_or(1.0, |prior| probability_kept(prior, &start));
+        if best.as_ref().is_none_or(|(most, _)| probability > *most) {
+            best = Some((probability, start));
         }
     }
-    Ok(chosen)
+    best.map(|(_, start)| start).ok_or_else(|| TrialError::NoApproach { target: target.object.name.clone() })
 }
 
 /// The attempts of a trial.
@@ -75,6 +75,9 @@ struct Draws<'a> {
     trial: u64,
     yaw_rad: f64,
 }
+
+/// Draws an attempt; `None` if the target is not reached this way.
+type Way<'a> = fn(&Draws<'a>, u32) -> Result<Option<Start>, TrialError>;
 
 impl<'a> Draws<'a> {
     fn new(hand: &'a Hand, target: &'a LiftTarget, options: &'a TrialOptions, seed: u64, trial: u64) -> Self {
@@ -92,16 +95,16 @@ impl<'a> Draws<'a> {
         stream(self.seed, self.trial << 20 | u64::from(attempt))
     }
 
-    fn in_turn(&self, attempt: u32) -> Result<Start, TrialError> {
-        let found = if self.options.protocol.approach == Approach::Planned {
-            self.planned(attempt)?
-        } else if attempt.is_multiple_of(2) {
-            self.straight_down(attempt)?.map_or_else(|| self.anywhere(attempt), |start| Ok(Some(start)))?
-        } else {
-            self.anywhere(attempt)?.map_or_else(|| self.straight_down(attempt), |start| Ok(Some(start)))?
-        };
-        let target = || self.target.object.name.clone();
-        found.ok_or_else(|| TrialError::NoApproach { target: target(), n_draws: MOST_DRAWS })
+    fn in_turn(&self, attempt: u32) -> Result<Option<Start>, TrialError> {
+        if self.options.protocol.approach == Approach::Planned {
+            return self.planned(attempt);
+        }
+        let (first, other): (Way<'a>, Way<'a>) = (Self::straight_down, Self::anywhere);
+        let (first, other) = if attempt.is_multiple_of(2) { (first, other) } else { (other, first) };
+        match first(self, attempt)? {
+            None => other(self, attempt),
+            found => Ok(found),
+        }
     }
 
     /// Approaches on which the open hand would come to the stand before it touches the target are drawn again: where the stand
@@ -142,7 +145,8 @@ impl<'a> Draws<'a> {
             let mut away_m = start.back_off_m;
             if away_m > 0.0 {
                 away_m += LEAST_BESIDE_M;
-                if top_m < protocol.stand_clearance_m + LEAST_BESIDE_M * descent {
+                // All of the closing hand stays so high.
+                if top_m + range.touch_tolerance_m < protocol.stand_clearance_m + LEAST_BESIDE_M * descent {
                     continue;
                 }
             }
