@@ -337,7 +337,7 @@ fn a_source_in_python_whose_samples_cannot_be_saved_is_refused() {
     let flow = dataflow_with(folder.path(), &with_source(folder.path(), "device"));
     let name = unique_name();
     let stderr =
-        text(&run(&["run", "--name", &name, "--set", "recorded_source.max_items=16384", utf8(&flow)], 1).stderr);
+        text(&run(&["run", "--name", &name, "--set", "recorded_source.max_items=65536", utf8(&flow)], 1).stderr);
     assert!(stderr.contains("expected at most") && stderr.contains("give a smaller max_items"), "{stderr}");
 }
 
