@@ -52,7 +52,7 @@ fn the_commands_of_the_first_day_make_a_graph_that_lifts() {
     assert!(hint.contains(learn.trim()), "{hint}");
     // Fewer lifts, at a bound that so few can keep. Of slippery objects as many lifts fail as succeed, so that few are enough to
     // learn from. With long time steps they take half the time.
-    let slippery = "{friction: 0.4, planner: {n_approaches: 4}, lift: {step_secs: 0.02}}";
+    let slippery = "{friction: 0.6, planner: {n_approaches: 4}, lift: {step_secs: 0.02}}";
     std::fs::write(demo.join("slippery.yaml"), slippery).expect("written");
     let few = format!("{} --lifts 125 --max-drops 0.5 --options slippery.yaml", learn.trim());
     let learned = run_script(&demo, folder.path(), &few);

@@ -24,7 +24,7 @@ fn the_graph_lifts_in_mujoco_and_slippery_things_are_dropped() {
     let name = unique_name();
     let flow = project().join("dataflow-live.yaml");
     let fixed = "trials --physics mujoco --lift-policy always --trials 12 --json --set lift_arbiter.max_age_ms=600000 \
-                 --set source.decision_timeout_s=600 --objects paper/candle-box@mu1,paper/candle-box@mu0.02";
+                 --set source.decision_timeout_s=600 --objects paper/wipe-box@mu1,paper/wipe-box@mu0.02";
     let flow = ["--dataflow", flow.to_str().expect("UTF-8"), "--name", &name];
     let (out, _) = run(&fixed.split_whitespace().chain(flow).collect::<Vec<_>>(), 0);
     assert_nothing_left(&name);
