@@ -50,7 +50,7 @@ fn the_commands_of_the_first_day_make_a_graph_that_lifts() {
     let hint = run_script(&demo, folder.path(), &blocks(part(1), "sh"));
     let learn = blocks(part(2), "sh");
     assert!(hint.contains(learn.trim()), "{hint}");
-    // Fewer lifts, at a bound that so few can keep. Of slippery objects as many lifts fail as succeed, so that few are enough to
+    // Fewer lifts, at a bound that so few can keep. Of slippery objects nearly as many lifts fail as succeed, so that few are enough to
     // learn from. With long time steps they take half the time.
     let slippery = "{friction: 0.6, planner: {n_approaches: 4}, lift: {step_secs: 0.02}}";
     std::fs::write(demo.join("slippery.yaml"), slippery).expect("written");
