@@ -356,12 +356,13 @@ fn path_of(part: &Part, param: &str) -> PathBuf {
     part.params.get(param).and_then(Value::as_str).unwrap_or_default().into()
 }
 
-/// The share of the lifts that at most drop when a look decides, by training or by the robot's own lifts.
+/// The share of the lifts that at most drop when a look decides, by training or by the robot's own lifts. Lifts that changed the
+/// model have withdrawn the bound of its training.
 fn most_drops(model: &Model, look: &str) -> Option<f64> {
     let own_lifts = model.training.own_lifts.as_ref().filter(|own| own.look == look);
     let policy = model.training.policies.iter().find(|policy| policy.look == look);
-    let promise = own_lifts.and_then(|own| own.promise).or(policy.and_then(|policy| policy.promise))?;
-    Some(promise.drops_of_lifts.at_most)
+    let promises = own_lifts.and_then(|own| own.promise).into_iter().chain(policy.and_then(|policy| policy.promise));
+    promises.map(|promise| promise.drops_of_lifts.at_most).min_by(f64::total_cmp)
 }
 
 /// The judge of a test lift, which follows a squeeze that is judged as well.

@@ -11,6 +11,7 @@ import math
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -468,10 +469,16 @@ class Models(Folder):
         cells = np.array([grasp.cells_newtons[rows] for grasp, rows in zip(grasps, settled)])
         self.assertEqual(cells.shape, (20, 6, 96))
         np.testing.assert_array_equal(model.predict_proba(joints, cells), probabilities)
-        # A frame alone votes as often as is needed, and the lowest probability of three frames decides.
+        # A frame alone votes as often as is needed, and the lowest probability of three frames, if none is filtered, decides.
         alone = np.array([model.predict_proba(joints[:, idx], cells[:, idx])[:, 1] for idx in range(3)])
-        is_one_sided = np.isin(model.predict(grasps).reason, ["stable", "unstable"])
-        np.testing.assert_array_equal(alone.min(axis=0)[is_one_sided], probabilities[is_one_sided, 1])
+        with tempfile.TemporaryDirectory() as folder:
+            shutil.copy(REPOSITORY / "hands/barrett-bh8-280.urdf", folder)
+            layout = Path(folder) / "unfiltered.yaml"
+            layout.write_text((REPOSITORY / "hands/barrett-bh8-280.yaml").read_text() + "median_filter: false\n")
+            unfiltered = blindgrasp.Model(MODEL, hand=layout)
+            is_one_sided = np.isin(unfiltered.predict(grasps).reason, ["stable", "unstable"])
+            lowest = alone.min(axis=0)[is_one_sided]
+            np.testing.assert_array_equal(lowest, unfiltered.predict_proba(grasps)[is_one_sided, 1])
         np.testing.assert_array_equal(model.predict_proba(joints[:, :1], cells[:, :1])[:, 1], alone[0])
         table = blindgrasp.Recording(HELD_OUT).to_frame()[:20]
         of_means = model.predict_proba(joints.mean(axis=1), cells.mean(axis=1))

@@ -61,13 +61,13 @@ fn a_failure_says_which_actions_have_changed() {
     let recording = recorded_run(folder.path());
     let file = |name: &str| folder.path().join(name).to_str().expect("UTF-8").to_owned();
     let (junit, summary) = (file("report.xml"), file("summary.md"));
-    let votes = ["--set", "lift_arbiter.votes=2"];
+    let votes = ["--set", "lift_arbiter.votes=1"];
     let reports = ["--junit", &junit, "--summary", &summary];
     let output = run(&[&["test", &recording], &votes[..], &reports[..]].concat(), 1);
-    let changed = "1 action changed: grasp 207: HOLD no_agreement -> LIFT stable (stable)";
+    let changed = "1 action changed: grasp 138: LIFT stable -> HOLD unstable (unstable)";
     assert!(text(&output.stdout).contains(changed), "{}", text(&output.stdout));
     let read = |path: &str| std::fs::read_to_string(path).expect("written");
-    assert!(read(&junit).contains("grasp 207: HOLD no_agreement"), "{}", read(&junit));
+    assert!(read(&junit).contains("grasp 138: LIFT stable"), "{}", read(&junit));
     assert!(read(&summary).starts_with("## blindgrasp test: 0 passed, 1 failed"), "{}", read(&summary));
     assert!(read(&summary).contains("| run.mcap | **failed** | 1 | /decision |"), "{}", read(&summary));
     // GitHub gives all steps one file.
@@ -98,11 +98,11 @@ fn names_that_are_not_utf8_are_text_in_json() {
 fn a_sweep_shows_the_decisions_with_each_value() {
     let folder = tempfile::tempdir().expect("a folder");
     let recording = recorded_run(folder.path());
-    let report = json_of(&["test", &recording, "--sweep", "lift_arbiter.votes=2,3", "--json"]);
+    let report = json_of(&["test", &recording, "--sweep", "lift_arbiter.votes=1,3", "--json"]);
     let of = |value: usize, name: &str| report["values"][value][name].clone();
-    assert_eq!((of(0, "value"), of(0, "n_actions_changed")), (json!("2"), json!(1)), "{report}");
+    assert_eq!((of(0, "value"), of(0, "n_actions_changed")), (json!("1"), json!(1)), "{report}");
     assert_eq!((of(1, "value"), of(1, "n_actions_changed")), (json!("3"), json!(0)), "{report}");
-    assert_eq!(of(0, "decisions")["n_lifts"].as_u64(), of(1, "decisions")["n_lifts"].as_u64().map(|n| n + 1));
+    assert_eq!(of(0, "decisions")["n_lifts"].as_u64().map(|n| n + 1), of(1, "decisions")["n_lifts"].as_u64());
     fails(&["test", &recording, "--sweep", "lift_arbiter.votse=2,3"], "votes");
 }
 
@@ -128,7 +128,7 @@ fn expectations_are_made_of_the_decisions_and_are_met() {
     let made = run(&["test", "--init", &recording], 0);
     assert!(text(&made.stdout).contains("run.expect.yaml: 240 grasps"), "{}", text(&made.stdout));
     let expected = std::fs::read_to_string(folder.path().join("run.expect.yaml")).expect("written");
-    assert!(expected.contains("accuracy_at_least: 0.8916\nfalse_positives_at_most: 14\n"), "{expected}");
+    assert!(expected.contains("accuracy_at_least: 0.8958\nfalse_positives_at_most: 14\n"), "{expected}");
     run(&["test", &recording], 0);
     // Another model decides worse.
     let failed = run(&["test", &recording, "--set", "model=recordings/paper-recipe.json"], 1);

@@ -155,11 +155,16 @@ pub fn warn_of_misfit(graph: &str, node: &str, param: &str, value: &Value) -> an
     Ok(())
 }
 
-/// What keeps an arbiter from lifting after a change, and did not before.
+/// What keeps an arbiter from lifting after a change, or voids a bound on drops, and did not before.
 fn new_misfits(before: &[Part], after: &[Part]) -> Vec<Misfit> {
-    let old = check_fit(before).errors;
-    let mut new = check_fit(after).errors;
-    new.retain(|misfit| misfit.kind == MisfitKind::Probe && !old.contains(misfit));
+    let misfits = |parts: &[Part]| {
+        let fit = check_fit(parts);
+        let counts = |misfit: &Misfit| matches!(misfit.kind, MisfitKind::Probe | MisfitKind::Bound);
+        fit.errors.into_iter().chain(fit.warnings).filter(counts).collect::<Vec<_>>()
+    };
+    let old = misfits(before);
+    let mut new = misfits(after);
+    new.retain(|misfit| !old.contains(misfit));
     new
 }
 

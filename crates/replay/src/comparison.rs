@@ -168,14 +168,14 @@ impl Coverage {
         Ok(Coverage { first, first_grasp_id, last_grasp_id, hand_id, is_attached, is_detached, is_cut_off })
     }
 
-    /// Whether the recording has all frames on which the decision about a grasp depends.
-    pub fn covers_decision(&self, grasp_id: u64) -> bool {
+    /// Whether the recording has all frames on which the contacts of a grasp and the decision about it depend.
+    pub fn covers_grasp(&self, grasp_id: u64) -> bool {
         !(self.is_attached && grasp_id == self.first_grasp_id)
     }
 
-    /// The decisions that cannot be compared, for a person to read.
+    /// What cannot be compared, for a person to read.
     pub fn notes(&self) -> Vec<String> {
-        let attached = "it was attached midway: the decision of its first grasp is not compared";
+        let attached = "it was attached midway: what the graph made of its first grasp is not compared";
         let detached = "it was detached midway: a decision of its last grasp that it does not have is not compared";
         let cut_off = "it was cut off: what it does not have at the end of an edge is not compared";
         let notes = [(self.is_attached, attached), (self.is_detached, detached), (self.is_cut_off, cut_off)];
@@ -335,7 +335,6 @@ impl Sides<'_> {
         }
         while let Some(record) = self.found.read()? {
             if self.is_uncovered(&record) {
-                self.comparison.n_not_compared += 1;
                 continue;
             }
             let mut header = *record.header();
@@ -363,9 +362,9 @@ impl Sides<'_> {
         }
     }
 
-    /// The decision about the grasp in which the recording begins depends on frames that were not recorded.
+    /// What the graph made of the grasp in which the recording begins depends on frames that were not recorded.
     fn is_uncovered(&self, record: &Record) -> bool {
-        record.is_said_once() && !self.coverage.covers_decision(record.grasp_id())
+        !self.edge.is_played && !self.coverage.covers_grasp(record.grasp_id())
     }
 
     fn pop_recorded(&mut self, what: What) {

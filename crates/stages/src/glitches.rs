@@ -1,4 +1,4 @@
-//! Finds glitches of cells, readings of one frame that no contact makes, and leaves them out if the hand's layout asks for it.
+//! Finds glitches of cells, readings of one frame that no contact makes, and leaves them out unless the hand's layout says no.
 //!
 //! With `median_filter`, a cell reads the median of its last three readings in a phase of a grasp; of the first two, the smaller
 //! one. So a spike of one frame is no contact, and a cell that one frame misses still feels. A contact comes and goes a frame later.
@@ -15,7 +15,7 @@ use blindgrasp_messages::Phase;
 
 /// The most cells of a hand whose readings are filtered. A node saves 256 KiB, and a cell that feels takes 64 bytes of an answer, 16
 /// of this filter and 24 of the watch for faulty sensors.
-pub const MAX_FILTERED_CELLS: usize = 2000;
+pub(crate) const MAX_FILTERED_CELLS: usize = 2000;
 
 /// A spike is so many noise thresholds high. A load at the threshold goes to and fro about it.
 const SPIKE_THRESHOLDS: f64 = 3.0;
@@ -47,7 +47,7 @@ struct Spikes {
 }
 
 impl GlitchFilter {
-    /// The cells of a frame, filtered if the hand's layout asks for it.
+    /// The cells of a frame, filtered unless the hand's layout says no.
     ///
     /// * `epoch`, `grasp_id` - the frame's.
     /// * `cells_newtons` - one value per cell of the hand. A frame that cannot be used comes back as it is.
@@ -131,7 +131,8 @@ impl GlitchFilter {
             "cells flicker: {n_spikes} spikes of one frame in {n_frames} frames, the highest at cell {of_pad} of pad {}",
             pad.name
         );
-        let remedy = if hand.median_filter { "" } else { "; median_filter: true in the hand's layout leaves them out" };
+        let is_off = !hand.median_filter && hand.n_cells() <= MAX_FILTERED_CELLS;
+        let remedy = if is_off { "; without median_filter: false in the hand's layout they are left out" } else { "" };
         Some(found + remedy)
     }
 }
@@ -185,7 +186,7 @@ mod tests {
     }
 
     #[test]
-    fn without_the_key_nothing_is_changed_and_flicker_is_named() {
+    fn without_the_filter_nothing_is_changed_and_flicker_is_named() {
         let (hand, mut filter) = (hand(false), GlitchFilter::default());
         for idx in 0..60 {
             let cells = frame(&hand, if idx % 3 == 0 { 0.4 } else { 0.0 });

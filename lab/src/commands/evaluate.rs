@@ -221,7 +221,10 @@ impl Job<'_> {
             }
             return Ok(());
         };
-        print_text(&curve_lines(look, curve, "kept", own_threshold(model, look), drop_costs).join("\n"))?;
+        print_text(
+            &curve_lines(look, curve, "kept", own_threshold(model, look), drop_costs.map(|price| (price, false)))
+                .join("\n"),
+        )?;
         let recordings: Vec<String> =
             self.arguments.inputs[1..].iter().map(|path| path.display().to_string()).collect();
         Ok(print_line(&format!(

@@ -206,7 +206,8 @@ pub(super) fn print_model(model: &Model, drop_costs: Option<f64>) -> std::io::Re
     if let Some(policy) = model.training.policies.last() {
         let kept = if is_of_the_papers_label(&model.training) { "stable" } else { "kept" };
         let own = own_threshold(model, &policy.look);
-        print_text(&curve_lines(&policy.look, &policy.curve, kept, own, drop_costs).join("\n"))?;
+        let price = drop_costs.map(|drop_costs| (drop_costs, drop_costs == policy.drop_costs));
+        print_text(&curve_lines(&policy.look, &policy.curve, kept, own, price).join("\n"))?;
     }
     Ok(())
 }
@@ -217,13 +218,15 @@ pub(super) fn own_threshold(model: &Model, look: &str) -> f64 {
     phase.and_then(|phase| model.look(*phase)).unwrap_or(&model.classifier).threshold_probability
 }
 
-/// The thresholds of the look that decides, for people, with the model's own and the cheapest for this price of a drop.
+/// The thresholds of the look that decides, for people, with the model's own and the cheapest for a price of a drop.
+///
+/// * `price` - the price, and whether training has chosen the model's own threshold for it: with the cost of probes, too.
 pub(super) fn curve_lines(
     look: &str,
     curve: &[ThresholdPoint],
     kept: &str,
     own: f64,
-    drop_costs: Option<f64>,
+    price: Option<(f64, bool)>,
 ) -> Vec<String> {
     let look = look.replace('_', "-");
     if curve.is_empty() {
@@ -233,9 +236,15 @@ pub(super) fn curve_lines(
         )];
     }
     let mut cheapest = None;
-    if let Some(drop_costs) = drop_costs {
+    if let Some((drop_costs, is_of_training)) = price {
+        // Few grasps an object make attempts uncertain: a threshold that keeps less and lifts less is never better.
+        let is_better = |a: &ThresholdPoint, b: &ThresholdPoint| a.kept >= b.kept && a.recall > b.recall;
         let cost = |point: &&ThresholdPoint| point.attempts_per_kept(drop_costs);
-        cheapest = curve.iter().min_by(|a, b| cost(a).total_cmp(&cost(b)));
+        let sensible = curve.iter().filter(|point| !curve.iter().any(|other| is_better(other, point)));
+        cheapest = match curve.iter().find(|point| point.threshold_probability == own) {
+            Some(chosen) if is_of_training => Some(chosen),
+            _ => sensible.min_by(|a, b| cost(a).total_cmp(&cost(b))),
+        };
     }
     let mut lines = vec![format!(
         "{:<27} {:>8} {:>9} {:>16} {:>9} {:>20}",
@@ -425,26 +434,28 @@ mod tests {
 
     #[test]
     fn the_price_of_a_drop_chooses_a_point_of_the_curve() {
-        let point = |threshold_probability, kept, attempts_per_lift| ThresholdPoint {
+        let point = |threshold_probability, kept, recall, attempts_per_lift| ThresholdPoint {
             threshold_probability,
             kept,
-            recall: 0.5,
+            recall,
             attempts_per_lift,
             given_up: 0.1,
             drops_at_most: Some(0.08),
         };
-        let curve = [point(0.5, 0.9, 2.0), point(0.933, 0.98, 6.0)];
-        let marked = |drop_costs| curve_lines("test_lifted", &curve, "kept", 0.933, drop_costs);
+        // The last one keeps no more and lifts less: its few attempts are chance.
+        let curve = [point(0.5, 0.9, 0.8, 2.0), point(0.933, 0.98, 0.5, 6.0), point(0.98, 0.98, 0.3, 1.0)];
+        let marked = |price| curve_lines("test_lifted", &curve, "kept", 0.933, price);
         let lines = marked(None);
-        assert_eq!((lines.len(), lines.iter().filter(|line| line.contains("cheapest")).count()), (3, 0));
+        assert_eq!((lines.len(), lines.iter().filter(|line| line.contains("cheapest")).count()), (4, 0));
         assert!(lines[2].contains("98.0 %") && lines[2].ends_with("8.0 %  the model's own"), "{lines:?}");
         // (2 + 10 x 0.1) / 0.9 = 3.3 attempts for each kept object, and (6 + 10 x 0.02) / 0.98 = 6.3.
-        let lines = marked(Some(10.0));
-        assert!(lines[1].contains("cheapest") && lines[3].ends_with("min_probability_stable=0.5"), "{lines:?}");
+        let lines = marked(Some((10.0, false)));
+        assert!(lines[1].contains("cheapest") && lines[4].ends_with("min_probability_stable=0.5"), "{lines:?}");
         // 13.3 and 8.2.
-        let lines = marked(Some(100.0));
+        let lines = marked(Some((100.0, false)));
         assert!(lines[2].ends_with("the model's own  the cheapest for this price of a drop"), "{lines:?}");
-        assert!(lines[3].ends_with("min_probability_stable=0"), "{lines:?}");
+        assert!(lines[4].ends_with("min_probability_stable=0"), "{lines:?}");
+        assert_eq!(marked(Some((10.0, true))), lines, "training has counted probes, too");
         let none = curve_lines("test_lifted", &[], "kept", 0.933, None);
         assert!(none[0].starts_with("no curve of thresholds when test-lifted"), "{none:?}");
     }

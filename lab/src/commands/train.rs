@@ -60,7 +60,7 @@ pub(super) struct Arguments {
     gamma: Option<f64>,
     /// Choose the thresholds by the price of a drop. They are those with the fewest attempts for each kept object, if a drop
     /// costs as much as so many attempts and the hand grasps again until it lifts, judged by folds of objects. Recordings with
-    /// probes get a threshold for each probe. The models of lifts that come with blindgrasp were trained with 60; 0 is for
+    /// probes get a threshold for each probe. The models of lifts that come with blindgrasp were trained with 30; 0 is for
     /// objects that may fall.
     #[arg(long, value_name = "ATTEMPTS", value_parser = |text: &str| number_in(text, 0.0..=1e6))]
     drop_costs: Option<f64>,

@@ -24,7 +24,7 @@ use blindgrasp_stages::{Hand, Judge, Judged, Model};
 use blindgrasp_viewer::{Abilities, Viewer};
 use serde_json::{Value, json};
 
-use super::super::{Outcome, print_line, stop_signal};
+use super::super::{Outcome, print_line, promises::shown_counts, stop_signal};
 use super::Rights;
 use super::control::control_of;
 use super::foxglove::Streams;
@@ -510,6 +510,8 @@ pub(super) fn add_frame(event: &mut Value, hand: &Hand, frame: &TactileFrame, co
 fn graph_event(now: &Look, before: Option<&Look>) -> anyhow::Result<String> {
     let mut event = serde_json::to_value(measure(now, before))?;
     event["warnings"] = json!(warnings(&now.status));
+    let said = now.status.nodes.iter().map(|node| (&node.node, shown_counts(&node.counts)));
+    event["said"] = json!(said.collect::<BTreeMap<_, _>>());
     let params = now.status.nodes.iter().map(|node| (&node.node, &node.params));
     event["params"] = json!(params.collect::<BTreeMap<_, _>>());
     if let Some(node) = now.status.nodes.iter().find(|node| node.params.get("driver") == Some(&"listen".into())) {

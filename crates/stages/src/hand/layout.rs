@@ -44,7 +44,7 @@ pub(super) struct Layout {
     #[serde(default)]
     cell_unit: CellUnit,
     #[serde(default)]
-    median_filter: bool,
+    median_filter: Option<bool>,
     pads: Vec<LayoutPad>,
     layouts: BTreeMap<String, Vec<LayoutCell>>,
 }
@@ -120,7 +120,7 @@ impl Layout {
             self_collision_margin_m: default_self_collision_margin_m(),
             edge_radius_m: 0.0,
             cell_unit: CellUnit::default(),
-            median_filter: false,
+            median_filter: None,
             pads: Vec::new(),
             layouts: BTreeMap::new(),
         }
@@ -158,7 +158,9 @@ impl Layout {
                 return Err(format!("{found} {what}, expected {least} to {most}"));
             }
         }
-        if self.median_filter && noise_thresholds_newtons.len() > MAX_FILTERED_CELLS {
+        let can_filter = noise_thresholds_newtons.len() <= MAX_FILTERED_CELLS;
+        let median_filter = self.median_filter.unwrap_or(can_filter);
+        if median_filter && !can_filter {
             let found = noise_thresholds_newtons.len();
             return Err(format!(
                 "median_filter is for at most {MAX_FILTERED_CELLS} cells, and the hand has {found}: leave it out"
@@ -186,7 +188,7 @@ impl Layout {
             ignored_shapes: tree.ignored_shapes,
             fixed_joints: tree.fixed_joints,
             cell_unit: self.cell_unit,
-            median_filter: self.median_filter,
+            median_filter,
             id: 0,
             description_id: 0,
             files: Arc::default(),
@@ -557,13 +559,13 @@ mod tests {
         let hand_of = |n_cells| Hand::parse(Path::new("skin.yaml"), &text_of(n_cells), |_| Ok(urdf.into()));
         let hand = hand_of(MAX_CELLS).expect("a hand");
         assert_eq!((hand.n_cells(), hand.noise_thresholds_newtons()), (MAX_CELLS, &[0.1; MAX_CELLS][..]));
+        assert!(!hand.median_filter && hand_of(MAX_FILTERED_CELLS).expect("a hand").median_filter);
         let error = hand_of(MAX_CELLS + 1).expect_err("too many").to_string();
         assert!(error.contains("16385 cells, expected 1 to 16384"), "{error}");
         let filtered = |n_cells| {
             let text = format!("{}\nmedian_filter: true\n", text_of(n_cells));
             Hand::parse(Path::new("skin.yaml"), &text, |_| Ok(urdf.into()))
         };
-        assert!(filtered(MAX_FILTERED_CELLS).expect("a hand").median_filter);
         let error = filtered(MAX_FILTERED_CELLS + 1).expect_err("too many").to_string();
         assert!(error.contains("median_filter is for at most 2000 cells, and the hand has 2001"), "{error}");
     }

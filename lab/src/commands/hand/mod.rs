@@ -10,7 +10,6 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail};
 use blindgrasp_messages::files::read_regular;
 use blindgrasp_operator::diagnostics::print_diagnostic;
-use blindgrasp_stages::glitches::MAX_FILTERED_CELLS;
 use blindgrasp_stages::hand::{
     BareHand, Cell, Hand, find_mesh, find_mesh_alike, part_below, read_urdf, with_meshes_renamed,
 };
@@ -395,9 +394,6 @@ fn layout(name: &str, hand: &Hand, pads: &[NewPad], bare: &BareHand) -> String {
     if !bare.open.is_empty() {
         let open: Vec<String> = bare.open.iter().map(|(name, value)| format!("{}: {value}", quoted(name))).collect();
         let _ = writeln!(text, "open: {{{}}}", open.join(", "));
-    }
-    if pads.iter().map(|pad| pad.cells.len()).sum::<usize>() <= MAX_FILTERED_CELLS {
-        text.push_str("# A reading that is there in one frame alone does not count: real skins have spikes.\nmedian_filter: true\n");
     }
     text.push_str("pads:\n");
     for pad in pads {

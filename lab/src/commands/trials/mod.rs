@@ -140,6 +140,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let (targets, warnings) = targets_and_warnings(&arguments.objects)?;
     warnings.iter().for_each(|warning| print_diagnostic(&format!("warning: {warning}")));
     let setup = Setup::new(arguments)?;
+    print_diagnostic("looking for an approach to each object …");
     let left_out = check_approaches(&setup.hand, &targets, &setup.options, arguments.seed, arguments.trials)?;
     if !left_out.is_empty() {
         print_diagnostic(&format!(

@@ -69,8 +69,11 @@ pub fn adapt_on(hand: &Hand, model: &Model, read: &Examples, robots: &[String]) 
         Some(day) => adapt_to_day(model, day, read)?,
         None => adapt_to_lifts(hand, model, read, robots)?,
     };
-    // They were for the probabilities before.
-    adapted.training.withdraw_promises();
+    let is_changed = Model { training: model.training.clone(), ..adapted.clone() } != *model;
+    if is_changed {
+        // They were for the probabilities before.
+        adapted.training.withdraw_promises();
+    }
     let new = read.trained_on();
     trained_on.objects.extend(new.objects);
     trained_on.grasps.extend(new.grasps);

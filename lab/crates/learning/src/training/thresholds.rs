@@ -101,8 +101,13 @@ impl Aim {
 impl Chosen {
     fn summary(self, roc_area: f64, grasps: &[Attempted], promises: bool) -> PolicySummary {
         let mut curve = threshold_curve(grasps, self.policy.thresholds, self.look);
-        if !promises {
-            curve.iter_mut().for_each(|point| point.drops_at_most = None);
+        for point in &mut curve {
+            if !promises {
+                point.drops_at_most = None;
+            } else if point.threshold_probability == self.policy.thresholds.lift {
+                // Of thresholds that the other objects choose, as the model promises.
+                point.drops_at_most = self.promise.map(|promise| promise.drops_of_lifts.at_most);
+            }
         }
         PolicySummary {
             roc_area,

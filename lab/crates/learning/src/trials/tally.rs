@@ -194,7 +194,8 @@ impl Tallies {
             *n += 1;
         }
         let total = tally("total", trials.values());
-        let unique: BTreeMap<u64, &TrialRecord> = records.iter().map(|record| (record.grasp_id, record)).collect();
+        let of_ended = records.iter().filter(|record| trials.contains_key(&record.trial));
+        let unique: BTreeMap<u64, &TrialRecord> = of_ended.map(|record| (record.grasp_id, record)).collect();
         let robot_secs = records.iter().map(|record| record.end_secs).fold(0.0, f64::max);
         let things = by_name(&trials, |record| &record.thing);
         Tallies {
