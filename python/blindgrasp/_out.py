@@ -98,7 +98,7 @@ def to_lerobot(
     `false`, or nothing without a label). The task is the object's name. What else is known of the grasp is in the fields of its
     episode (meta/episodes), which LeRobot's own splits drop. `timestamp` has the whole
     number of frames a second that is nearest to the first grasp's. `python3 -P -m blindgrasp.lerobot` reads the dataset
-    back with `--cells observation.tactile --joints observation.state --label stable --phase phase`.
+    back with `--cells observation.tactile --joints observation.state --label stable --phase phase --class object_class`.
 
     Raises as `to_parquet`, and FileExistsError if the folder exists.
     """

@@ -182,7 +182,7 @@ fn overview_lines(overview: &Overview) -> Vec<(&str, String)> {
     ];
     for (name, topic) in overview.topics.iter().filter(|(_, topic)| !topic.is_ours) {
         let n_messages = topic.n_messages.map_or("?".into(), |n| n.to_string());
-        lines.push(("not ours", format!("{name} {n_messages} ({})", topic.schema)));
+        lines.push(("others", format!("{name} {n_messages} ({})", topic.schema)));
     }
     // A simulation's report is long; --json has it.
     for (name, metadata) in overview.metadata.iter().filter(|(name, _)| *name != REPORT_METADATA) {

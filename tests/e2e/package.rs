@@ -147,7 +147,7 @@ fn a_version_is_published_only_if_it_is_the_same_everywhere() {
 
     dated("2026-11-27");
     std::fs::write(clone.join("CITATION.cff"), citation).expect("written");
-    let names = "sed -i s/example.org/example.com/ Cargo.toml CITATION.cff $(git ls-files '*package.xml')";
+    let names = "sed -i -e s/example.org/grasps.dev/ -e 's/The founders of blindgrasp/A. Person/' Cargo.toml CITATION.cff $(git ls-files '*package.xml')";
     succeed(Command::new("sh").args(["-c", names]).current_dir(&clone));
     commit();
     let said = publish(true);

@@ -565,7 +565,7 @@ fn info_names_oddities_and_foreign_topics() {
     );
     let (_, stdout, _) = info_command(&[text]);
     for part in [
-        "not ours          /contact_points 30 (sensor_msgs/msg/PointCloud2)",
+        "others            /contact_points 30 (sensor_msgs/msg/PointCloud2)",
         "/tactile: 1 numbers are missing",
         "duration ",
     ] {

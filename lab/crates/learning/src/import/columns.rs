@@ -93,10 +93,13 @@ fn column(header: &[String], name: &str, flag: &str) -> Result<usize, String> {
 
 /// The columns that each pattern matches, as they lie in the table.
 fn matches(header: &[String], patterns: &[String], flag: &str) -> Result<Vec<Vec<usize>>, String> {
+    // Tables of the Python package name a sense so: `joint_*` means the angles.
+    let is_torque = |name: &str| name.starts_with("joint_torques_");
     let of = |pattern: &String| {
-        let found: Vec<usize> = (0..header.len())
-            .filter(|idx| !header[*idx].is_empty() && matches_pattern(pattern, &header[*idx]))
-            .collect();
+        let fits = |name: &String| {
+            !name.is_empty() && matches_pattern(pattern, name) && (is_torque(pattern) || !is_torque(name))
+        };
+        let found: Vec<usize> = (0..header.len()).filter(|idx| fits(&header[*idx])).collect();
         if found.is_empty() {
             Err(format!("{flag}: no column is called '{pattern}'; {}", help(header, pattern)))
         } else {

@@ -52,6 +52,17 @@ pub struct TrialsReport {
     pub records_without_gate: Vec<TrialRecord>,
 }
 
+/// Adds the records of another shard as if its robot had gone on after the one before: each numbers its grasps and its time from 0.
+fn append(records: &mut Vec<TrialRecord>, more: Vec<TrialRecord>) {
+    let n_grasps = records.iter().map(|record| record.grasp_id + 1).max().unwrap_or(0);
+    let secs = records.iter().map(|record| record.end_secs).fold(0.0, f64::max);
+    records.extend(more.into_iter().map(|record| TrialRecord {
+        grasp_id: record.grasp_id + n_grasps,
+        end_secs: record.end_secs + secs,
+        ..record
+    }));
+}
+
 impl TrialsReport {
     /// The report of a whole run, from those of all its shards.
     ///
@@ -85,8 +96,8 @@ impl TrialsReport {
                 late.n_undecided += more.n_undecided;
             }
             known.n_left_out += report.n_left_out;
-            known.records_with_gate.extend(report.records_with_gate);
-            known.records_without_gate.extend(report.records_without_gate);
+            append(&mut known.records_with_gate, report.records_with_gate);
+            append(&mut known.records_without_gate, report.records_without_gate);
         }
         let mut whole = whole.ok_or("expected the reports of all shards, found none")?;
         let n = whole.shard.take().map_or(0, |(_, n)| n);
@@ -432,18 +443,32 @@ pub(super) mod tests {
 
     #[test]
     fn the_reports_of_all_shards_are_that_of_the_whole() {
-        let whole = both();
+        // Each run numbers its grasps and its time from 0, and an attempt takes 10 s.
+        let counted = |mut report: TrialsReport| {
+            for records in [&mut report.records_with_gate, &mut report.records_without_gate] {
+                for (idx, record) in records.iter_mut().enumerate() {
+                    (record.grasp_id, record.end_secs) = (idx as u64, 10.0 * (idx + 1) as f64);
+                }
+            }
+            report.count();
+            report
+        };
+        let whole = counted(both());
         let shard = |idx: u64| {
             let mut part =
                 TrialsReport { shard: Some((idx, 2)), late: Some(LateDecisions::default()), ..whole.clone() };
             part.records_with_gate.retain(|record| record.trial % 2 == idx);
             part.records_without_gate.retain(|record| record.trial % 2 == idx);
-            part.count();
+            let part = counted(part);
             // As a file has it.
             serde_json::from_str::<TrialsReport>(&serde_json::to_string(&part).expect("JSON")).expect("a report")
         };
         let merged = TrialsReport::merge(vec![shard(1), shard(0)]).expect("whole");
-        assert_eq!(merged.records_with_gate, whole.records_with_gate);
+        let [found, expected] = [&merged, &whole].map(|report| report.with_gate.as_ref().expect("trials"));
+        assert_eq!((found.n_probes, found.kept_per_hour), (expected.n_probes, expected.kept_per_hour));
+        let names =
+            |report: &TrialsReport| report.records_with_gate.iter().map(|r| (r.trial, r.attempt)).collect::<Vec<_>>();
+        assert_eq!(names(&merged), names(&whole));
         let text = |report: &TrialsReport| tables(report).iter().flat_map(Table::to_text).collect::<Vec<_>>();
         assert_eq!(text(&merged), text(&whole));
         let other = TrialsReport { seed: 2, ..shard(0) };
