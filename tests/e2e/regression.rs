@@ -76,7 +76,7 @@ fn a_failure_says_which_actions_have_changed() {
     let output = run(&[&["test", &recording, "--json"], &votes[..]].concat(), 1);
     let report: Value = serde_json::from_slice(&output.stdout).expect("JSON");
     let found = &report["recordings"][0]["changed_actions"];
-    assert_eq!((&found[0]["grasp_id"], found.as_array().map(Vec::len)), (&json!(207), Some(1)), "{found}");
+    assert_eq!((&found[0]["grasp_id"], found.as_array().map(Vec::len)), (&json!(138), Some(1)), "{found}");
 }
 
 #[test]

@@ -192,7 +192,7 @@ fn what_to_expect_names_the_label_and_the_grasps_without_contact() {
     }
     let help = text(&run(&["train", "--help"], 0).stdout);
     let help = help.split_whitespace().collect::<Vec<_>>().join(" ");
-    assert!(help.contains("trained with 60") && help.contains("A stage whose strictest threshold"), "{help}");
+    assert!(help.contains("trained with 30") && help.contains("A stage whose strictest threshold"), "{help}");
 }
 
 /// Grasps of a pincer with a squeeze: the settled hand feels the force of every second grasp, and the squeezed hand that of each.
