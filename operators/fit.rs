@@ -357,12 +357,14 @@ fn path_of(part: &Part, param: &str) -> PathBuf {
 }
 
 /// The share of the lifts that at most drop when a look decides, by training or by the robot's own lifts. Lifts that changed the
-/// model have withdrawn the bound of its training.
+/// model have withdrawn the bound of its training; others count where they speak against it.
 fn most_drops(model: &Model, look: &str) -> Option<f64> {
     let own_lifts = model.training.own_lifts.as_ref().filter(|own| own.look == look);
     let policy = model.training.policies.iter().find(|policy| policy.look == look);
-    let promises = own_lifts.and_then(|own| own.promise).into_iter().chain(policy.and_then(|policy| policy.promise));
-    promises.map(|promise| promise.drops_of_lifts.at_most).min_by(f64::total_cmp)
+    let own = own_lifts.and_then(|own| own.promise).map(|promise| promise.drops_of_lifts);
+    let trained = policy.and_then(|policy| policy.promise).map(|promise| promise.drops_of_lifts);
+    let refuting = own.filter(|own| trained.is_none_or(|trained| own.estimate > trained.at_most));
+    Some(refuting.or(trained)?.at_most)
 }
 
 /// The judge of a test lift, which follows a squeeze that is judged as well.

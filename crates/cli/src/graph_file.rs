@@ -132,13 +132,15 @@ pub fn refuse_misfit(graph: &str, request: &SwapRequest) -> anyhow::Result<()> {
             part.params.insert(name.clone(), value.into());
         }
     }
-    let Some(misfit) = new_misfits(&before, &after).into_iter().next() else { return Ok(()) };
-    if request.allow_mismatch {
-        warn(&misfit);
-        return Ok(());
+    for misfit in new_misfits(&before, &after) {
+        if request.allow_mismatch || misfit.kind == MisfitKind::Bound {
+            warn(&misfit);
+            continue;
+        }
+        let Misfit { node, message, help, .. } = misfit;
+        bail!("not swapped: node '{node}': {message}; {help}; or say --allow-mismatch")
     }
-    let Misfit { node, message, help, .. } = misfit;
-    bail!("not swapped: node '{node}': {message}; {help}; or say --allow-mismatch")
+    Ok(())
 }
 
 /// Warns if a node's new param keeps the arbiter from lifting.
@@ -164,7 +166,11 @@ fn new_misfits(before: &[Part], after: &[Part]) -> Vec<Misfit> {
     };
     let old = misfits(before);
     let mut new = misfits(after);
-    new.retain(|misfit| !old.contains(misfit));
+    // The words about a bound name the model and the promise, which may have become better.
+    let is_known = |misfit: &Misfit, of: &Misfit| {
+        of == misfit || (misfit.kind == MisfitKind::Bound && (of.kind, &of.node) == (misfit.kind, &misfit.node))
+    };
+    new.retain(|misfit| !old.iter().any(|of| is_known(misfit, of)));
     new
 }
 

@@ -168,14 +168,15 @@ impl Coverage {
         Ok(Coverage { first, first_grasp_id, last_grasp_id, hand_id, is_attached, is_detached, is_cut_off })
     }
 
-    /// Whether the recording has all frames on which the contacts of a grasp and the decision about it depend.
-    pub fn covers_grasp(&self, grasp_id: u64) -> bool {
+    /// Whether the recording has all frames on which the decision about a grasp depends.
+    pub fn covers_decision(&self, grasp_id: u64) -> bool {
         !(self.is_attached && grasp_id == self.first_grasp_id)
     }
 
     /// What cannot be compared, for a person to read.
     pub fn notes(&self) -> Vec<String> {
-        let attached = "it was attached midway: what the graph made of its first grasp is not compared";
+        let attached =
+            "it was attached midway: its first two frames and the decision of its first grasp are not compared";
         let detached = "it was detached midway: a decision of its last grasp that it does not have is not compared";
         let cut_off = "it was cut off: what it does not have at the end of an edge is not compared";
         let notes = [(self.is_attached, attached), (self.is_detached, detached), (self.is_cut_off, cut_off)];
@@ -334,7 +335,7 @@ impl Sides<'_> {
             self.recorded.window.push_back(Sample { header, record });
         }
         while let Some(record) = self.found.read()? {
-            if self.is_uncovered(&record) {
+            if self.is_uncovered(&record, record.header().seq) {
                 continue;
             }
             let mut header = *record.header();
@@ -350,7 +351,7 @@ impl Sides<'_> {
     /// The number in the replay of a recorded sample; `None` if it cannot be compared.
     fn number_in_replay(&mut self, record: &Record) -> Option<u64> {
         let header = record.header();
-        if self.is_uncovered(record) {
+        if self.is_uncovered(record, since(&self.coverage.first, header).unwrap_or(0)) {
             return None;
         }
         match record {
@@ -362,9 +363,14 @@ impl Sides<'_> {
         }
     }
 
-    /// What the graph made of the grasp in which the recording begins depends on frames that were not recorded.
-    fn is_uncovered(&self, record: &Record) -> bool {
-        !self.edge.is_played && !self.coverage.covers_grasp(record.grasp_id())
+    /// Whether the sample with this number of the replay depends on frames that were not recorded, as the decision about the grasp
+    /// in which the recording begins does. The contacts of a frame depend on the two before it.
+    fn is_uncovered(&self, record: &Record, seq: u64) -> bool {
+        if record.is_said_once() {
+            return !self.coverage.covers_decision(record.grasp_id());
+        }
+        let Coverage { first, is_attached, .. } = self.coverage;
+        *is_attached && !self.edge.is_played && record.header().epoch == first.epoch && seq < 2
     }
 
     fn pop_recorded(&mut self, what: What) {

@@ -201,6 +201,8 @@ impl Learned {
         let before = classifier.unsure_from_probability;
         let unsure_from = if before >= classifier.threshold_probability {
             self.threshold_probability
+        } else if self.correction == Correction::default() {
+            before.min(self.threshold_probability)
         } else {
             probability(self.correction.apply(log_odds_of(before))).min(self.threshold_probability)
         };

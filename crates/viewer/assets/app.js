@@ -208,7 +208,7 @@ const showGraph = (graph) => {
   say(graph.warnings.length ? graph.warnings.join("; ") : graph.state, graph.warnings.length > 0);
   graph.nodes.forEach((node, idx) => {
     const isWell = node.state === "running" || node.state === "done";
-    fill(byId("nodes"), idx, [node.node, node.state, node.pid ?? "-", node.cpu_percent?.toFixed(1) ?? "-", node.n_restarts, node.n_swaps, graph.said[node.node].join(", ")],
+    fill(byId("nodes"), idx, [node.node, node.state, node.pid ?? "-", node.cpu_percent?.toFixed(1) ?? "-", node.n_restarts, node.n_swaps, (graph.said[node.node] ?? []).join(", ")],
       [2, 3, 4, 5], [...(isWell ? [] : [1]), ...(node.n_restarts ? [4] : [])]);
   });
   cut(byId("nodes"), graph.nodes.length);

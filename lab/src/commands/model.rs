@@ -235,17 +235,7 @@ pub(super) fn curve_lines(
              one from labelled lifts)"
         )];
     }
-    let mut cheapest = None;
-    if let Some((drop_costs, is_of_training)) = price {
-        // Few grasps an object make attempts uncertain: a threshold that keeps less and lifts less is never better.
-        let is_better = |a: &ThresholdPoint, b: &ThresholdPoint| a.kept >= b.kept && a.recall > b.recall;
-        let cost = |point: &&ThresholdPoint| point.attempts_per_kept(drop_costs);
-        let sensible = curve.iter().filter(|point| !curve.iter().any(|other| is_better(other, point)));
-        cheapest = match curve.iter().find(|point| point.threshold_probability == own) {
-            Some(chosen) if is_of_training => Some(chosen),
-            _ => sensible.min_by(|a, b| cost(a).total_cmp(&cost(b))),
-        };
-    }
+    let cheapest = price.and_then(|price| cheapest(curve, own, price));
     let mut lines = vec![format!(
         "{:<27} {:>8} {:>9} {:>16} {:>9} {:>20}",
         format!("threshold when {look}"),
@@ -279,6 +269,18 @@ pub(super) fn curve_lines(
         lines.push(format!("to choose it: blindgrasp set lift_arbiter.min_probability_stable={threshold}"));
     }
     lines
+}
+
+/// The cheapest threshold for a price of a drop. Training has chosen `own` for its own price, with the cost of probes.
+fn cheapest(curve: &[ThresholdPoint], own: f64, (drop_costs, is_of_training): (f64, bool)) -> Option<&ThresholdPoint> {
+    if is_of_training {
+        return curve.iter().find(|point| point.threshold_probability == own);
+    }
+    // Few grasps an object make attempts uncertain: a threshold that keeps less and lifts less is never better.
+    let is_worse =
+        |point: &ThresholdPoint| curve.iter().any(|other| other.kept >= point.kept && other.recall > point.recall);
+    let cost = |point: &&ThresholdPoint| point.attempts_per_kept(drop_costs);
+    curve.iter().filter(|point| !is_worse(point)).min_by(|a, b| cost(a).total_cmp(&cost(b)))
 }
 
 fn model_json(model: &Model) -> anyhow::Result<serde_json::Value> {

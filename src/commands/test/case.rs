@@ -108,7 +108,7 @@ impl Runner<'_> {
         let decisions = Decisions::read(&found)?;
         if let Some(of_decisions) = decisions_edge(&recording, &mut case.checks)? {
             let mut changed = decisions.changed_since(&Decisions::read(&recording)?);
-            changed.retain(|changed| coverage.covers_grasp(changed.grasp_id));
+            changed.retain(|changed| coverage.covers_decision(changed.grasp_id));
             of_decisions.text += &describe_changes(&changed).map_or(String::new(), |text| format!("; {text}"));
             case.changed = changed;
         }

@@ -45,7 +45,7 @@ impl Sweep {
                 let before = Decisions::read(recording)?;
                 let coverage = Coverage::of(recording, &fed.topic)?;
                 let changed = decisions.changed_since(&before);
-                let n = changed.iter().filter(|changed| coverage.covers_grasp(changed.grasp_id)).count();
+                let n = changed.iter().filter(|changed| coverage.covers_decision(changed.grasp_id)).count();
                 n_changed = if before.is_empty() { None } else { n_changed.map(|so_far| so_far + n) };
             }
             let n_labelled = tally.n_labelled;

@@ -149,22 +149,16 @@ impl Layout {
         let pads = self.pads(&tree)?;
         let cells = pads.iter().flat_map(|pad| &pad.cells);
         let noise_thresholds_newtons: Vec<f64> = cells.map(|cell| cell.noise_threshold_newtons).collect();
+        let n_filtered = if self.median_filter == Some(true) { noise_thresholds_newtons.len() } else { 0 };
         for (what, found, least, most) in [
             ("pads", pads.len(), least_cells, MAX_PADS),
             ("cells", noise_thresholds_newtons.len(), least_cells, MAX_CELLS),
             ("joints", joints.len(), 1, MAX_JOINTS),
+            ("cells with median_filter", n_filtered, 0, MAX_FILTERED_CELLS),
         ] {
             if found < least || found > most {
                 return Err(format!("{found} {what}, expected {least} to {most}"));
             }
-        }
-        let can_filter = noise_thresholds_newtons.len() <= MAX_FILTERED_CELLS;
-        let median_filter = self.median_filter.unwrap_or(can_filter);
-        if median_filter && !can_filter {
-            let found = noise_thresholds_newtons.len();
-            return Err(format!(
-                "median_filter is for at most {MAX_FILTERED_CELLS} cells, and the hand has {found}: leave it out"
-            ));
         }
         if !(0.0..=0.02).contains(&self.self_collision_margin_m) {
             return Err(format!("self_collision_margin_m is {}, expected 0 to 0.02", self.self_collision_margin_m));
@@ -183,12 +177,12 @@ impl Layout {
             name: self.name,
             joints,
             links,
+            median_filter: self.median_filter.unwrap_or(noise_thresholds_newtons.len() <= MAX_FILTERED_CELLS),
             noise_thresholds_newtons,
             pads,
             ignored_shapes: tree.ignored_shapes,
             fixed_joints: tree.fixed_joints,
             cell_unit: self.cell_unit,
-            median_filter,
             id: 0,
             description_id: 0,
             files: Arc::default(),
@@ -567,7 +561,7 @@ mod tests {
             Hand::parse(Path::new("skin.yaml"), &text, |_| Ok(urdf.into()))
         };
         let error = filtered(MAX_FILTERED_CELLS + 1).expect_err("too many").to_string();
-        assert!(error.contains("median_filter is for at most 2000 cells, and the hand has 2001"), "{error}");
+        assert!(error.contains("2001 cells with median_filter, expected 0 to 2000"), "{error}");
     }
 
     #[test]

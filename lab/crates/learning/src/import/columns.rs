@@ -94,7 +94,7 @@ fn column(header: &[String], name: &str, flag: &str) -> Result<usize, String> {
 /// The columns that each pattern matches, as they lie in the table.
 fn matches(header: &[String], patterns: &[String], flag: &str) -> Result<Vec<Vec<usize>>, String> {
     // Tables of the Python package name a sense so: `joint_*` means the angles.
-    let is_torque = |name: &str| name.starts_with("joint_torques_");
+    let is_torque = |name: &str| name.starts_with("joint_torques");
     let of = |pattern: &String| {
         let fits = |name: &String| {
             !name.is_empty() && matches_pattern(pattern, name) && (is_torque(pattern) || !is_torque(name))
