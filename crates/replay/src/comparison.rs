@@ -173,7 +173,7 @@ impl Coverage {
         !(self.is_attached && grasp_id == self.first_grasp_id)
     }
 
-    /// What cannot be compared, for a person to read.
+    /// The samples that cannot be compared, for people.
     pub fn notes(&self) -> Vec<String> {
         let attached =
             "it was attached midway: its first two frames and the decision of its first grasp are not compared";
