@@ -10,6 +10,7 @@ use std::io::Error;
 use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt, PermissionsExt};
 use std::os::unix::net::UnixListener;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use iceoryx2::prelude::{CallbackProgression, NodeState};
 use iceoryx2::prelude::{Config, FileName, LogLevel, Node, NodeBuilder, NodeName, SemanticString, SignalHandlingMode};
@@ -48,6 +49,8 @@ const LETTERS: &[u8; 36] = b"abcdefghijklmnopqrstuvwxyz0123456789";
 const N_LETTERS: usize = 8;
 /// So many names are tried, in case that one is taken.
 const N_TRIES: u32 = 8;
+/// Another thread may free the resources of other dead processes for so long.
+const CLEANUP_LIMIT: Duration = Duration::from_secs(10);
 /// A folder in which any user may remove and rename the files of others has this bit not set.
 const STICKY_BIT: u32 = 0o1000;
 /// Rights of users other than the owner.
@@ -304,7 +307,8 @@ pub fn clean_dead_nodes(domain: &NamespaceWiring) {
     let Ok(config) = config(domain) else { return };
     let _ = Node::<PrivateService>::list(&config, |state| {
         if let NodeState::Dead(view) = state {
-            let _ = view.try_remove_stale_resources();
+            // iceoryx2 lets one thread of a process do so at a time.
+            let _ = view.blocking_remove_stale_resources(CLEANUP_LIMIT);
         }
         CallbackProgression::Continue
     });

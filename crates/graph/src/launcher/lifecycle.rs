@@ -524,6 +524,10 @@ impl<S: Surroundings> Lifecycle<S> {
     pub(super) fn on_end(&mut self, id: u64, status: ExitStatus, sample: Option<SampleId>) {
         let is_memory_full = self.site.is_memory_full();
         let death = Death { at: self.now, status: Some(status), sample, is_memory_full };
+        if !status.success() {
+            // Until then its neighbours count its ports among those that live.
+            self.site.reap();
+        }
         if let Some(instance) = self.instances_mut().find(|instance| instance.id == id && instance.is_running()) {
             instance.death = Some(death);
         }
@@ -599,9 +603,6 @@ impl<S: Surroundings> Lifecycle<S> {
                 continue;
             }
             self.site.forget(instance.id);
-            if instance.killed.is_some() {
-                self.site.reap();
-            }
         }
         for id in late {
             self.kill(id, None);

@@ -63,6 +63,7 @@ struct Process {
     is_stuck: bool,
     lingers: bool,
     end: Option<i32>,
+    is_reaped: bool,
     commands: VecDeque<Command>,
 }
 
@@ -185,7 +186,9 @@ impl Surroundings for World {
         }
     }
 
-    fn reap(&mut self) {}
+    fn reap(&mut self) {
+        self.processes.values_mut().for_each(|process| process.is_reaped = process.end.is_some());
+    }
 
     fn is_memory_full(&self) -> bool {
         false
@@ -347,6 +350,8 @@ impl History {
         let process = self.life.site.processes.get_mut(&id).expect("it is there");
         process.end = Some(status);
         self.life.on_end(id, ExitStatus::from_raw(status), None);
+        let has_its_resources = status != 0 && !self.life.site.processes[&id].is_reaped;
+        self.life.site.is_to_be(!has_its_resources, "the resources of a process that dies are freed at once");
         true
     }
 

@@ -238,7 +238,6 @@ impl<S: Surroundings> Lifecycle<S> {
             return;
         }
         self.start_active(idx);
-        self.site.reap();
     }
 
     /// The processes of these nodes could not be started again.
@@ -288,7 +287,6 @@ impl<S: Surroundings> Lifecycle<S> {
         ));
         self.site.has_status(&format!("degraded: {}", message.lines().next().unwrap_or_default()));
         self.degraded = Some(message);
-        self.site.reap();
     }
 
     /// Takes back a node that was given up, after a swap has given it a new process.

@@ -553,7 +553,6 @@ impl<S: Surroundings> Lifecycle<S> {
     }
 
     fn end_going_back(&mut self, swap: &Swap) -> Next {
-        self.site.reap();
         if !swap.has_exchanged {
             return self.abandon(swap, &swap.failure);
         }
@@ -610,7 +609,6 @@ impl<S: Surroundings> Lifecycle<S> {
             ));
             nodes.push(target.swapped.clone());
         }
-        self.site.reap();
         self.site.answer(swap.client, Reply::Swapped { nodes });
         Next::IsOver
     }
