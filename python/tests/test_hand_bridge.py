@@ -405,10 +405,9 @@ class Bridge(unittest.TestCase):
             with mock.patch("sys.stderr"):
                 self.source = bridge.line_protocol.Source(f"unix:{folder}/tactile.hand")
             classes = mock.patch.object(bridge, "message_class", lambda where, kind, field: kind)
-            kept = mock.patch.object(bridge.line_protocol, "Source", lambda address, hand: self.source)
             said = io.StringIO()
-            with mock.patch.dict(sys.modules, modules), contextlib.redirect_stderr(said), classes, kept:
-                bridge.bridge(TABLE, None)
+            with mock.patch.dict(sys.modules, modules), contextlib.redirect_stderr(said), classes:
+                bridge.bridge(TABLE, self.source)
             self.source.connection.shutdown(socket.SHUT_RDWR)
             self.source.connection.close()
             thread.join()

@@ -22,7 +22,7 @@ import threading
 import time
 import traceback
 
-from blindgrasp_ros.node import arguments, spin
+from blindgrasp_ros.node import arguments, ended_by_signals, spin
 
 # Calls of `decide` that wait at the same time; each has a thread. The eldest makes room for a new one, without a decision.
 MAX_WAITING = 16
@@ -232,6 +232,7 @@ class Publishing:
         self.others["/diagnostics"].publish(message)
 
 
+@ended_by_signals
 def serve(arguments):
     import rclpy
     from blindgrasp_msgs.srv import Decide
@@ -239,7 +240,6 @@ def serve(arguments):
     from rclpy.clock import Clock, ClockType
     from rclpy.executors import MultiThreadedExecutor
 
-    rclpy.init()
     node = rclpy.create_node("blindgrasp", namespace=arguments.namespace)
     publishing = Publishing(node, arguments.graph)
     node.create_service(Decide, "decide", publishing.answer, callback_group=ReentrantCallbackGroup())
@@ -255,13 +255,10 @@ def serve(arguments):
 
     echo = [arguments.program, "echo", "--cdr", "--graph", arguments.graph, *arguments.outputs]
     top = [arguments.program, "top", "--json", arguments.graph]
-    # It is made before the threads say something: a program that hears the node may end it.
     node.create_timer(1.0, publishing.take_back, clock=Clock(clock_type=ClockType.STEADY_TIME))
     threading.Thread(target=work, args=(echo, publishing.take, publishing.begin_anew), daemon=True).start()
     threading.Thread(target=work, args=(top, publishing.diagnose, publishing.has_no_state), daemon=True).start()
     spin(node, MultiThreadedExecutor(num_threads=MAX_WAITING + 4))
-    # The threads may be in rclpy, which an orderly end of Python would take from them.
-    os._exit(0)
 
 
 def main():
@@ -275,6 +272,8 @@ def main():
         if shutil.which(program) is None:
             sys.exit(f"the program {program} is not in PATH: install it" + (", or name it with --program" if program != "setpriv" else ""))
     serve(given)
+    # The threads may be in rclpy, which an orderly end of Python would take from them.
+    os._exit(0)
 
 
 if __name__ == "__main__":

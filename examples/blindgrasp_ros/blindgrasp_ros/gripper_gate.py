@@ -26,7 +26,7 @@ import math
 import threading
 import time
 
-from blindgrasp_ros.node import arguments, clock_fault, nanos_of, spin, topic_fault
+from blindgrasp_ros.node import arguments, clock_fault, ended_by_signals, nanos_of, spin, topic_fault
 
 # Seconds between two looks whether a goal was cancelled, or a signal came.
 LOOK_S = 0.05
@@ -135,6 +135,7 @@ def positions_of(command, is_parallel):
     return list(command.position) if is_parallel else [command.position]
 
 
+@ended_by_signals
 def serve(arguments):
     """Serves goals until a signal comes."""
     import control_msgs.action
@@ -146,7 +147,6 @@ def serve(arguments):
 
     # Humble has no ParallelGripperCommand.
     kind = getattr(control_msgs.action, "ParallelGripperCommand" if arguments.parallel else "GripperCommand")
-    rclpy.init()
     node = rclpy.create_node(arguments.name)
     controller = ActionClient(node, kind, arguments.controller)
     decisions, is_grasp = Decisions(), grasps(arguments)

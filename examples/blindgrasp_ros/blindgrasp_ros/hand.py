@@ -45,7 +45,7 @@ import sys
 import time
 
 from blindgrasp_ros import line_protocol
-from blindgrasp_ros.node import arguments, spin
+from blindgrasp_ros.node import arguments, ended_by_signals, spin
 
 WORDS = ("open", "closing", "settled", "squeezing", "squeezed", "test_lifting", "test_lifted", "lifting", "ended", "kept", "dropped")
 # Angles older than this are missed: joint_states often comes at 10 to 30 Hz. Messages that waited for longer make no frame.
@@ -418,16 +418,14 @@ def message_class(where, name, field):
     return found
 
 
-def bridge(table, address, hand=None):
+@ended_by_signals
+def bridge(table, source):
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
     from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
     from rclpy.subscription import Subscription
 
-    check_table(table)
-    source = line_protocol.Source(address, hand=hand)
     frames = Frames(table, source.hand)
-    rclpy.init()
     node = rclpy.create_node("blindgrasp_hand")
     executor = SingleThreadedExecutor()
     is_humble = not hasattr(Subscription, "CallbackType")
@@ -512,7 +510,8 @@ def work():
     with open(given.table, encoding="utf-8") as file:
         table = yaml.safe_load(file)
     try:
-        bridge(table, given.address, given.hand)
+        check_table(table)
+        bridge(table, line_protocol.Source(given.address, hand=given.hand))
     except ValueError as error:
         sys.exit(f"{given.table}: {error}")
 

@@ -6,12 +6,11 @@ Put the motion of your arm into `lift`. Nothing else may start it.
 import argparse
 import time
 
-import rclpy
 from blindgrasp_msgs.msg import Decision
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-from blindgrasp_ros.node import arguments, clock_fault, nanos_of, spin, topic_fault
+from blindgrasp_ros.node import arguments, clock_fault, ended_by_signals, nanos_of, spin, topic_fault
 
 # Two LIFTs of one grasp that are valid until times less than this apart are one decision: a graph needs longer to start.
 SAME_RUN_NANOS = 1_000_000_000
@@ -56,10 +55,14 @@ class LiftGate(Node):
         self.get_logger().info(f"grasp {decision.grasp_id}: lift, probability {decision.probability_stable:.2f}")
 
 
+@ended_by_signals
+def serve():
+    spin(LiftGate())
+
+
 def main():
     argparse.ArgumentParser(description=__doc__).parse_args(arguments())
-    rclpy.init()
-    spin(LiftGate())
+    serve()
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """The parts that the nodes of this package share."""
 
+import functools
 import sys
 import time
 
@@ -13,23 +14,36 @@ def arguments():
     return own[: own.index("--ros-args")] if "--ros-args" in own else own
 
 
+def ended_by_signals(work):
+    """Decorates the work of a node: it begins with ROS 2, and a signal ends it at any moment without an error."""
+
+    @functools.wraps(work)
+    def begin(*of):
+        import rclpy
+
+        rclpy.init()
+        try:
+            work(*of)
+        except KeyboardInterrupt:
+            pass
+        except Exception:
+            # A signal that ends ROS 2 makes the next call of rclpy raise one of several errors.
+            if rclpy.ok():
+                raise
+        finally:
+            rclpy.try_shutdown()
+
+    return begin
+
+
 def spin(node, executor=None):
     """Runs a node until a signal comes."""
     import rclpy
     from rclpy.clock import Clock, ClockType
 
-    try:
-        # rclpy can fall asleep on a signal that comes just then; it looks again when it wakes.
-        node.create_timer(1.0, lambda: None, clock=Clock(clock_type=ClockType.STEADY_TIME))
-        rclpy.spin(node, executor)
-    except KeyboardInterrupt:
-        pass
-    except Exception:
-        # A signal that ends ROS 2 makes rclpy.spin raise one of several errors.
-        if rclpy.ok():
-            raise
-    finally:
-        rclpy.try_shutdown()
+    # rclpy can fall asleep on a signal that comes just then; it looks again when it wakes.
+    node.create_timer(1.0, lambda: None, clock=Clock(clock_type=ClockType.STEADY_TIME))
+    rclpy.spin(node, executor)
 
 
 def nanos_of(stamp):
