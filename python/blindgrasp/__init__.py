@@ -11,6 +11,8 @@
 
     blindgrasp.to_parquet("recordings/", "frames.parquet")  # and to_lerobot: all frames, for other tools
 
+    blindgrasp.from_parquet("frames.parquet", "again/")     # and a dataset of to_lerobot: the same recordings
+
     predictions = blindgrasp.Model("model.json").predict("run.mcap")
 
     with blindgrasp.run("dataflow.yaml") as graph:        # starts the graph, and ends it
@@ -28,7 +30,7 @@ Nothing here computes a feature or a probability, so that Python and a robot nev
 from ._graph import ReplayedDecisions, Run, echo, replay, run
 from ._import import from_table
 from ._model import Model, PredictedGrasp, Predictions
-from ._out import to_lerobot, to_parquet
+from ._out import from_parquet, to_lerobot, to_parquet
 from ._program import ProgramError, ProgramNotFoundError, program
 from ._recording import Grasp, Recording, RecordingError, read
 from ._skin import Skin, SkinOptions, skin
@@ -54,6 +56,7 @@ __all__ = [
     "SkinOptions",
     "__version__",
     "echo",
+    "from_parquet",
     "from_table",
     "program",
     "read",

@@ -1,4 +1,4 @@
-"""Recordings as Parquet files and as LeRobot datasets. Both need pyarrow.
+"""Recordings as Parquet files and as LeRobot datasets, and back. Both need pyarrow.
 
 The recordings are read twice, because all grasps get the same columns. Memory holds some thousand frames.
 """
@@ -6,9 +6,11 @@ The recordings are read twice, because all grasps get the same columns. Memory h
 from __future__ import annotations
 
 import importlib
+import itertools
 import json
 import os
 import shutil
+import tempfile
 from collections.abc import Iterator, Sequence
 from os import PathLike, fspath
 from pathlib import Path
@@ -17,16 +19,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ._program import answer_of
 from ._recording import Grasp, Recording
 from ._tables import cell_names
 from ._types import Label
 
 Source = str | PathLike[str] | Recording
 
-# What became of a grasp: the fields of LiftOutcome that are columns, and their types in Arrow.
+# What became of a grasp: the fields of LiftOutcome, and their types in Arrow.
 OUTCOME = {
-    "lifted": "bool", "held": "bool", "slip_m": "float64", "turn_rad": "float64", "mass_kg": "float64",
-    "friction": "float64",
+    "trial": "uint64", "attempt": "uint64", "lifted": "bool", "held": "bool", "has_quality": "bool", "slip_m": "float64",
+    "turn_rad": "float64", "epsilon": "float64", "volume": "float64", "mass_kg": "float64", "friction": "float64",
+    "thing": "string", "group": "string", "probed": "bool", "disturbed": "bool",
 }  # fmt: skip
 # What is equal for all frames of a grasp.
 OF_GRASP = {
@@ -51,8 +55,7 @@ def to_parquet(
     grasp: `recording`, `hand`, `hand_id`, `model`, `day`, `epoch`, `grasp_id`, and its label, decision and outcome; then
     `grasp` (its running number in the file), `seq`, `stamp_nanos`, `phase` and `predicted` (the probability that the
     graph predicted of the frame); then `joint_0`, …, `cell_0`, … (with `hand`, as in `Recording.to_frame`,
-    `cell_palm_0`) and the other senses. What is not known is missing. `from_table` with `grasp_column="grasp"` and
-    `phase_column="phase"` reads it back.
+    `cell_palm_0`) and the other senses. What is not known is missing. `from_parquet` reads it back.
 
     Raises ModuleNotFoundError without pyarrow, and ValueError if the recordings are of different hands.
     """
@@ -94,11 +97,10 @@ def to_lerobot(
     """Writes recordings to a new folder as a LeRobot dataset of format v3.0, an episode for each grasp.
 
     `recordings` and `hand` are those of `to_parquet`. Features are `observation.state` (the joints), `observation.tactile`
-    (the cells), other senses like `observation.gravity_m_per_s2`, `phase`, `stamp_nanos`, `predicted` and `stable` (`true`,
-    `false`, or nothing without a label). The task is the object's name. What else is known of the grasp is in the fields of its
-    episode (meta/episodes), which LeRobot's own splits drop. `timestamp` has the whole
-    number of frames a second that is nearest to the first grasp's. `python3 -P -m blindgrasp.lerobot` reads the dataset
-    back with `--cells observation.tactile --joints observation.state --label stable --phase phase --class object_class`.
+    (the cells), other senses like `observation.gravity_m_per_s2`, `phase`, `seq`, `stamp_nanos`, `predicted` and `stable`
+    (`true`, `false`, or nothing without a label). The task is the object's name. What else is known of the grasp is in the
+    fields of its episode (meta/episodes), which LeRobot's own splits drop. `timestamp` has the whole number of frames a
+    second that is nearest to the first grasp's. `from_parquet` reads the dataset back.
 
     Raises as `to_parquet`, and FileExistsError if the folder exists.
     """
@@ -111,6 +113,106 @@ def to_lerobot(
     except BaseException:
         shutil.rmtree(root)
         raise
+
+
+def from_parquet(
+    source: str | PathLike[str], out: str | PathLike[str], *, hand: str | PathLike[str] | None = None, overwrite: bool = False
+) -> list[Recording]:
+    """Writes the recordings of a file of `to_parquet`, or of a dataset of `to_lerobot`, to the folder `out`, and returns them.
+
+    Each has the name that it had, the same frames with their numbers and times, and the same labels and outcomes; a label
+    and an outcome get the times of the grasp's first and last frame. Decisions and predictions are not written: a graph or
+    `blindgrasp predict` makes them. `hand` is the layout of a hand that is not built in.
+
+    Raises ModuleNotFoundError without pyarrow, ValueError if the source is not written so or two recordings have one name, and
+    ProgramError if the hand is another one or a file exists.
+    """
+    pa = _pyarrow()
+    path, folder = Path(fspath(source)), Path(fspath(out))
+    folder.mkdir(parents=True, exist_ok=True)
+    rows = _rows_of_dataset(pa, path) if path.is_dir() else _rows_of_file(pa, path)
+    recordings: list[Recording] = []
+    for name, of_recording in itertools.groupby(rows, lambda row: row["recording"]):
+        to = folder / name
+        if Path(name).name != name or any(to == known.path for known in recordings):
+            raise ValueError(f"{path}: expected the names of different files in the column recording, found {name!r}")
+        with tempfile.TemporaryDirectory() as lines_in:
+            lines = Path(lines_in) / name
+            with lines.open("w", encoding="utf-8") as stream:
+                layout = _write_lines(of_recording, stream)
+            words = [f"--hand={layout if hand is None else fspath(hand)}", f"--out={to}", *(["--overwrite"] if overwrite else [])]
+            answer_of(["import", str(lines), "--lines", "--json", *words])
+        recordings.append(Recording(to))
+    return recordings
+
+
+def _rows_of_file(pa: Any, path: Path) -> Iterator[dict[str, Any]]:
+    """Frames as dicts: the values of the grasp, `seq`, `stamp_nanos`, `phase`, and the values of each sense as a list."""
+    with pa.parquet.ParquetFile(path) as file:
+        found = file.schema_arrow.names
+        _check(path, {*OF_GRASP, "grasp", "seq", "stamp_nanos", "phase", "predicted"}, found)
+        columns: dict[str, list[str]] = {}
+        for name in found[found.index("predicted") + 1 :]:
+            sense = "cell" if name.startswith("cell_") else name.rpartition("_")[0]
+            columns.setdefault(sense, []).append(name)
+        for batch in file.iter_batches(1000):
+            for row in batch.to_pylist():
+                yield row | {"senses": {sense: [row[name] for name in names] for sense, names in columns.items()}}
+
+
+def _rows_of_dataset(pa: Any, root: Path) -> Iterator[dict[str, Any]]:
+    """As `_rows_of_file`."""
+    episodes: dict[int, dict[str, Any]] = {}
+    for path in sorted(root.glob("meta/episodes/*/*.parquet")):
+        table = pa.parquet.read_table(path)
+        _check(path, {*OF_GRASP, "episode_index"}, table.column_names)
+        episodes |= {row["episode_index"]: row for row in table.to_pylist()}
+    sense_of = {"observation.state": "joint", "observation.tactile": "cell"}
+    for path in sorted(root.glob("data/*/*.parquet")):
+        with pa.parquet.ParquetFile(path) as file:
+            _check(path, {"episode_index", "seq", "stamp_nanos", "phase"}, file.schema_arrow.names)
+            for batch in file.iter_batches(1000):
+                for row in batch.to_pylist():
+                    observed = {name: value for name, value in row.items() if name.startswith("observation.")}
+                    values = {name: value if isinstance(value, list) else [value] for name, value in observed.items()}
+                    senses = {sense_of.get(name, name.removeprefix("observation.")): value for name, value in values.items()}
+                    yield row | episodes[row["episode_index"]] | {"grasp": row["episode_index"], "senses": senses}
+
+
+def _check(path: Path, expected: set[str], found: Sequence[str]) -> None:
+    if missing := sorted(expected - set(found)):
+        raise ValueError(f"{path}: expected a file that to_parquet or to_lerobot of this version wrote; it has no {missing[0]!r}")
+
+
+def _write_lines(rows: Iterator[dict[str, Any]], stream: Any) -> str:
+    """Writes frames, labels and outcomes as `blindgrasp export` does, and returns the name of the hand."""
+    n_labels = n_outcomes = 0
+    seen: set[tuple[int, int]] = set()
+
+    def write(topic: str, seq: int, row: dict[str, Any], data: dict[str, Any]) -> None:
+        header = {"topic": topic, "seq": seq, "hand_id": row["hand_id"], "epoch": row["epoch"], "stamp_nanos": row["stamp_nanos"]}
+        print(json.dumps(header | {"data": {"grasp_id": row["grasp_id"]} | data}), file=stream)
+
+    for _, of_grasp in itertools.groupby(rows, lambda row: row["grasp"]):
+        first = row = next(of_grasp)
+        key = (first["epoch"], first["grasp_id"])
+        if key in seen:
+            raise ValueError(f"two recordings are called {first['recording']!r}: write them to different files")
+        seen.add(key)
+        if first["stable"] is not None:
+            label = {name: first[name] for name in ("stable", "epsilon", "volume")}
+            label |= {name: first[name] or "" for name in ("object", "object_class")}
+            write("/truth", n_labels, first, label)
+            n_labels += 1
+        for row in itertools.chain([first], of_grasp):
+            frame = {"joints": row["senses"].pop("joint"), "cells_newtons": row["senses"].pop("cell"), "phase": row["phase"]}
+            # A grasp that lacks a sense has no number of it.
+            frame |= {sense: values for sense, values in row["senses"].items() if not np.isnan(np.array(values, float)).all()}
+            write("/tactile", row["seq"], row, frame | {"day": int(row["day"] or 0)})
+        if row["outcome_lifted"] is not None:
+            write("/outcome", n_outcomes, row, {name: row[f"outcome_{name}"] for name in OUTCOME})
+            n_outcomes += 1
+    return first["hand"]
 
 
 def _pyarrow() -> Any:
@@ -213,8 +315,8 @@ class _LeRobot:
         named = {"joint": "observation.state", "cell": "observation.tactile"}
         self.feature_of = {sense: named.get(sense, f"observation.{sense}") for sense, width in data.widths.items() if width}
         shapes = {name: (data.widths[sense], "float64") for sense, name in self.feature_of.items()}
-        shapes |= {"phase": (1, "string"), "stable": (1, "string"), "stamp_nanos": (1, "int64"), "predicted": (1, "float64"), "timestamp": (1, "float32")}
-        shapes |= {name: (1, "int64") for name in ("frame_index", "episode_index", "index", "task_index")}
+        shapes |= {"phase": (1, "string"), "stable": (1, "string"), "predicted": (1, "float64"), "timestamp": (1, "float32")}
+        shapes |= {name: (1, "int64") for name in ("seq", "stamp_nanos", "frame_index", "episode_index", "index", "task_index")}
         self.features = {name: {"dtype": kind, "shape": [n], "names": None} for name, (n, kind) in shapes.items()}
         for sense, name in self.feature_of.items():
             self.features[name]["names"] = [f"{sense}_{value}" for value in data.names(sense)]
@@ -265,7 +367,7 @@ class _LeRobot:
     def _tables(self, recording: Recording, place: dict[str, int]) -> Iterator[Any]:
         for grasp in recording:
             n, known = len(grasp.seq), _of_grasp(recording, grasp)
-            task = known["object"] or "unknown"
+            task = known["object"] or known["outcome_thing"] or "unknown"
             task_idx = self.tasks.setdefault(task, len(self.tasks))
             episode = {"episode_index": len(self.episodes), "length": n, "tasks": [task]}
             episode |= {"dataset_from_index": self.n_frames, "dataset_to_index": self.n_frames + n}
@@ -275,6 +377,7 @@ class _LeRobot:
             columns: dict[str, Any] = {
                 "phase": grasp.phase.tolist(),
                 "stable": [{True: "true", False: "false"}.get(known["stable"], "")] * n,
+                "seq": grasp.seq,
                 "stamp_nanos": grasp.stamp_nanos,
                 "predicted": grasp.probability_stable,
                 "timestamp": (frames / (self.data.frames_per_second or 1)).astype(np.float32),

@@ -16,8 +16,8 @@ frames, whichever is found first. A feature counts with its value in the last fr
 true there if the object was kept. Booleans are the texts true and false. Episodes without a label are left out.
 
 The table has the last frames up to the moment of --at or --settled, as frames of the settled hand. The fingers must have
-closed by then, and the lift must not have begun. A dataset does not say when that is, and it is not checked. With --phase
-it has all frames, and the feature says the phase of each, as in datasets of blindgrasp.to_lerobot.
+closed by then, and the lift must not have begun. A dataset does not say when that is, and it is not checked. Datasets of
+blindgrasp.to_lerobot have it in the feature phase; blindgrasp.from_parquet reads all of them back.
 """
 
 from __future__ import annotations
@@ -167,8 +167,8 @@ class _Conversion:
         self.asked |= {"at": given.at} if given.at and not _is_number(given.at) else {}
         for option, name in self.asked.items():
             self.data.need(f"--{option}", name, known)
-        self.settled, _, self.settled_value = (given.settled or f"{given.phase or 'timestamp'}=").rpartition("=")
-        self.data.need("--at, --phase, --settled FEATURE=VALUE", self.settled)
+        self.settled, _, self.settled_value = (given.settled or "timestamp=").rpartition("=")
+        self.data.need("--at, --settled FEATURE=VALUE", self.settled)
         self.from_frames = {name for name in self.asked.values() if name not in known}
         names = {name for parts in self.parts.values() for name, _, _ in parts} | self.from_frames
         self.names = sorted(names | {"episode_index", "frame_index", "timestamp", self.settled})
@@ -177,7 +177,7 @@ class _Conversion:
     def write(self, stream) -> None:
         columns = [column for parts in self.parts.values() for _, _, columns in parts for column in columns]
         writer = csv.writer(stream, lineterminator="\n")
-        more = [name for name in (*NAMED, "phase") if getattr(self.given, name)]
+        more = [name for name in NAMED if getattr(self.given, name)]
         writer.writerow(["grasp", "object", "label", *more, *columns])
         n, n_done, told = len(self.data.fields), 0, time.monotonic()
         for path, episodes in self.data.files.items():
@@ -228,13 +228,12 @@ class _Conversion:
             if not word:
                 raise _Refused(f"expected a name in '{getattr(self.given, option)}' (--{option}), found none")
         named = [_short(words["object"]), words["label"], *(_short(words[name]) for name in NAMED if name in words)]
-        lines, phase = [], self.given.phase
-        for row in rows if phase else self._settled_rows(value, rows, words.get("at", self.given.at)):
+        lines = []
+        for row in self._settled_rows(value, rows, words.get("at", self.given.at)):
             numbers = {kind: self._numbers(value, parts, row) for kind, parts in self.parts.items()}
             if "joints" in numbers:
                 numbers["joints"] = numbers["joints"] * self.scale + self.offset
-            phases = [_word(value(phase, row))] if phase else []
-            lines.append([episode, *named, *phases, *(float(number) for of_kind in numbers.values() for number in of_kind)])
+            lines.append([episode, *named, *(float(number) for of_kind in numbers.values() for number in of_kind)])
         self.labels[words["label"]] += 1
         self.objects[words["object"]] += 1
         return lines
@@ -279,7 +278,7 @@ class _Conversion:
         words += ["--cells", patterns["cells"]]
         words += ["--joint-columns", patterns["joints"]] if given.joints else ["--joints", "NAME=VALUE"]
         words += ["--label", "label", "--stable-value", given.stable_value, "--group", "object"]
-        for name, option in {**NAMED, "phase": "--phase-column"}.items():
+        for name, option in NAMED.items():
             words += [option, name] if getattr(given, name) else []
         return shlex.join([*words, "--out", str(given.table.with_suffix(".mcap"))])
 
@@ -377,7 +376,6 @@ def main() -> int:
     moment = parser.add_mutually_exclusive_group(required=True)
     moment.add_argument("--at", metavar="SECONDS", help="from the episode's start, or its end if negative; or its field")
     moment.add_argument("--settled", metavar="FEATURE=VALUE", help="the last frames of the first run with this value")
-    moment.add_argument("--phase", metavar="FEATURE", help="all frames, each in the phase that this feature says")
     add("--frames", type=int, default=3, metavar="N", help="settled frames of each grasp [default: 3]")
     add("--hand", default="HAND", help="the hand of the command that is printed")
     add("--skip-bad", action="store_true", help="leave out episodes with bad values, and list them")

@@ -209,19 +209,21 @@ class LeRobot(unittest.TestCase):
         stats = json.loads((root / "meta/stats.json").read_text())["observation.tactile"]
         for name, expected in (("mean", cells.mean(axis=0)), ("std", cells.std(axis=0)), ("max", cells.max(axis=0))):
             np.testing.assert_allclose(stats[name], expected, atol=1e-9)
-        words = ["--hand", "barrett-bh8-280", "--joints", "observation.state", "--joint-scale", "1", "--phase", "phase"]
-        words += ["--class", "object_class"]
-        done = self.converted(root, *words, cells="observation.tactile", label="stable")
-        for grasp, again in zip(grasps, self.imported(done), strict=True):
-            for name in ("joints", "cells_newtons", "phase"):
-                np.testing.assert_array_equal(getattr(again, name), getattr(grasp, name))
-            names = ("is_stable", "object_id", "object_class")
-            self.assertEqual([getattr(again.label, name) for name in names], [getattr(grasp.label, name) for name in names])
+        again = blindgrasp.from_parquet(root, self.folder / "again")
+        self.assertEqual([recording.path.name for recording in again], [path.name for path in recordings])
+        for grasp, copied in zip(grasps, (grasp for recording in again for grasp in recording), strict=True):
+            for name in ("seq", "stamp_nanos", "joints", "cells_newtons", "phase"):
+                np.testing.assert_array_equal(getattr(copied, name), getattr(grasp, name))
+            self.assertEqual((copied.label, copied.epoch, copied.day), (grasp.label, grasp.epoch, grasp.day))
         # LeRobot's own splits drop the fields of episodes.
         episodes.drop(columns="stable").to_parquet(root / "meta/episodes/chunk-000/file-000.parquet")
-        before = self.table.read_text(encoding="utf-8")
-        self.converted(root, *words, "--overwrite", cells="observation.tactile", label="stable")
-        self.assertEqual(self.table.read_text(encoding="utf-8"), before)
+        with self.assertRaisesRegex(ValueError, "file-000.parquet: .* it has no 'stable'"):
+            blindgrasp.from_parquet(root, self.folder / "more")
+        words = ["--hand", "barrett-bh8-280", "--joints", "observation.state", "--joint-scale", "1", "--settled", "phase=settled"]
+        done = self.converted(root, *words, cells="observation.tactile", label="stable")
+        for grasp, copied in zip(grasps, self.imported(done), strict=True):
+            np.testing.assert_array_equal(copied.cells_newtons, grasp.cells_newtons[grasp.phase == "settled"][-3:])
+            self.assertEqual((copied.label.is_stable, copied.label.object_id), (grasp.label.is_stable, grasp.label.object_id))
         with self.assertRaises(FileExistsError):
             blindgrasp.to_lerobot(recordings, root)
 

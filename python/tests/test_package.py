@@ -230,7 +230,7 @@ class Recordings(Folder):
 
     def test_all_frames_go_to_parquet_and_come_back(self):
         recording, outcome = self.with_an_outcome()
-        path, again = self.folder / "frames.parquet", self.folder / "again.mcap"
+        path = self.folder / "frames.parquet"
         blindgrasp.to_parquet(recording, path, hand="barrett-bh8-280")
         frames, grasps = pd.read_parquet(path), blindgrasp.read(recording)
         self.assertEqual(frames["cell_finger_1_3"].tolist(), [cell for grasp in grasps for cell in grasp.cells_newtons[:, 27]])
@@ -243,13 +243,50 @@ class Recordings(Folder):
         self.assertEqual((last["outcome_lifted"], last["outcome_held"]), (outcome["lifted"], outcome["held"]))
         self.assertEqual(grasps[11].outcome, outcome)
         self.assertTrue(frames[frames["grasp_id"] < 11]["outcome_lifted"].isna().all())
-        columns = {"grasp_column": "grasp_id", "phase_column": "phase", "class_column": "object_class"}
-        blindgrasp.from_table(frames, again, hand="barrett-bh8-280", **columns)
-        for grasp, copied in zip(grasps, blindgrasp.read(again), strict=True):
-            for name in ("joints", "cells_newtons", "phase"):
+        [again] = blindgrasp.from_parquet(path, self.folder / "again")
+        self.assert_same(grasps, again)
+        with self.assertRaisesRegex(blindgrasp.ProgramError, "--overwrite"):
+            blindgrasp.from_parquet(path, self.folder / "again")
+        blindgrasp.from_parquet(path, self.folder / "again", overwrite=True)
+
+    def assert_same(self, grasps, again):
+        """All but decisions and predictions."""
+        for grasp, copied in zip(grasps, again, strict=True):
+            for name in ("seq", "stamp_nanos", "joints", "cells_newtons", "phase"):
                 np.testing.assert_array_equal(getattr(copied, name), getattr(grasp, name))
-            names = ("is_stable", "object_id", "object_class")
-            self.assertEqual([getattr(copied.label, name) for name in names], [getattr(grasp.label, name) for name in names])
+            self.assertEqual(copied.senses.keys(), grasp.senses.keys())
+            for name, values in grasp.senses.items():
+                np.testing.assert_array_equal(copied.senses[name], values)
+            for name in ("grasp_id", "epoch", "hand_id", "day", "outcome"):
+                self.assertEqual(getattr(copied, name), getattr(grasp, name))
+            np.testing.assert_equal(vars(copied.label) if copied.label else None, vars(grasp.label) if grasp.label else None)
+
+    def test_grasps_with_lost_cells_other_senses_one_label_or_none_come_back(self):
+        own = self.folder / "own.jsonl"
+        lines = [line for line in exported(ORDINARY, "/tactile", "/truth") if line["data"]["grasp_id"] in (0, 1)]
+        stable = next(line for line in lines if line["topic"] == "/truth" and line["data"]["stable"])
+        kept = [line for line in lines if line["topic"] == "/tactile"] + [stable]
+        for line in kept[:14]:
+            line["data"]["cells_newtons"][3] = None
+            line["data"] |= {"gravity_m_per_s2": [0.5, 0.0, -9.8], "day": 20261124}
+        own.write_text("\n".join(map(json.dumps, kept)))
+        path, recording = self.folder / "frames.parquet", self.folder / "own.mcap"
+        words = ["--lines", "--hand", "barrett-bh8-280", "--out"]
+        subprocess.run([str(blindgrasp.program()), "import", str(own), *words, str(recording)], check=True, capture_output=True)
+        grasps = blindgrasp.read(recording)
+        self.assertTrue(np.isnan(grasps[0].cells_newtons[0, 3]))
+        self.assertEqual([len(grasps), [grasp.label is None for grasp in grasps].count(True)], [2, 1])
+        blindgrasp.to_parquet(recording, path)
+        blindgrasp.to_lerobot(recording, self.folder / "dataset")
+        for source in (path, self.folder / "dataset"):
+            [again] = blindgrasp.from_parquet(source, self.folder / f"again-{source.name}")
+            self.assert_same(grasps, again)
+        copied = self.folder / "copied" / recording.name
+        copied.parent.mkdir()
+        copied.write_bytes(recording.read_bytes())
+        blindgrasp.to_parquet([recording, copied], path)
+        with self.assertRaisesRegex(ValueError, "two recordings are called 'own.mcap'"):
+            blindgrasp.from_parquet(path, self.folder / "twice")
 
     def test_grasps_of_two_recordings_come_back_unmerged(self):
         recording, _ = self.with_an_outcome()

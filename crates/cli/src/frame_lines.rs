@@ -10,7 +10,7 @@ use serde_json::Value;
 
 use blindgrasp_messages::file_kind::FileKind;
 use blindgrasp_messages::files::open_regular;
-use blindgrasp_messages::{GraspTruth, Header, OwnedSenses, Phase, Recorded, Stamped, TactileFrame};
+use blindgrasp_messages::{GraspTruth, Header, LiftOutcome, OwnedSenses, Phase, Recorded, Stamped, TactileFrame};
 use blindgrasp_stages::Hand;
 use blindgrasp_tactile::cell_zeros::{AllowedReadings, CellZeros};
 use blindgrasp_tactile::{ExpectedHand, line_protocol};
@@ -22,18 +22,20 @@ const MAX_BYTES: u64 = 1 << 30;
 /// The size limit of a line: thousands of cells.
 const MAX_LINE_BYTES: u64 = 4 << 20;
 
-/// The frames of lines, and the labels of their grasps by number.
+/// The frames of lines, and what they say of the grasps.
 pub struct FrameLines {
     pub frames: Vec<Stamped<TactileFrame>>,
-    pub truths: BTreeMap<u64, GraspTruth>,
-    /// Of the labels that have a line of their own.
-    pub headers_of_truths: BTreeMap<u64, Header>,
+    /// The labels by grasp, with their headers if they have lines of their own.
+    pub truths: BTreeMap<u64, (Option<Header>, GraspTruth)>,
+    pub outcomes: Vec<Stamped<LiftOutcome>>,
 }
 
-/// A line: a frame, with the outcome of its lift if it says it and names the object; a label; or a sample of another topic.
+/// A line: a frame, with the outcome of its lift if it says it and names the object; what is known of a grasp; or a sample of
+/// another topic.
 enum Line {
     Frame(Stamped<TactileFrame>, Option<GraspTruth>),
     Truth(Stamped<GraspTruth>),
+    Outcome(Stamped<LiftOutcome>),
     Other,
 }
 
@@ -54,7 +56,7 @@ pub fn read_frames(file: &Path, hand: &Hand) -> anyhow::Result<FrameLines> {
     };
     let mut input = input.take(MAX_BYTES + 1);
     let mut frames: Vec<Stamped<TactileFrame>> = Vec::new();
-    let (mut truths, mut headers_of_truths) = (BTreeMap::new(), BTreeMap::new());
+    let (mut truths, mut outcomes) = (BTreeMap::new(), Vec::new());
     // Of lines of a bridge: whether they have numbers.
     let mut has_seq = None;
     let mut zeros = CellZeros::new(hand, false);
@@ -67,21 +69,25 @@ pub fn read_frames(file: &Path, hand: &Hand) -> anyhow::Result<FrameLines> {
         if line.is_empty() {
             continue;
         }
-        let (frame, truth) = match read_line(line, &frames, hand, &mut zeros).with_context(place)? {
-            Line::Frame(frame, truth) => (Some(frame), truth),
-            Line::Truth(truth) => {
-                headers_of_truths.entry(truth.message.grasp_id).or_insert(truth.header);
-                (None, Some(truth.message))
-            }
-            Line::Other => (None, None),
-        };
+        let read = read_line(line, &frames, hand, &mut zeros).with_context(place)?;
         let has_seq_here = line.contains("\"seq\"");
         if !line.contains("\"data\"") && *has_seq.get_or_insert(has_seq_here) != has_seq_here {
             bail!("{}: expected seq in all lines or in none", place());
         }
-        frames.extend(frame);
+        let truth = match read {
+            Line::Frame(frame, truth) => {
+                frames.push(frame);
+                truth.map(|truth| (None, truth))
+            }
+            Line::Truth(Stamped { header, message }) => Some((Some(header), message)),
+            Line::Outcome(outcome) => {
+                outcomes.push(outcome);
+                None
+            }
+            Line::Other => None,
+        };
         if let Some(truth) = truth {
-            truths.entry(truth.grasp_id).or_insert(truth);
+            truths.entry(truth.1.grasp_id).or_insert(truth);
         }
     }
     if let (Some(has_seq), Some(first)) = (has_seq, frames.first()) {
@@ -95,7 +101,7 @@ pub fn read_frames(file: &Path, hand: &Hand) -> anyhow::Result<FrameLines> {
     if frames.is_empty() {
         bail!("{}: expected lines with tactile frames, found none", file.display());
     }
-    Ok(FrameLines { frames, truths, headers_of_truths })
+    Ok(FrameLines { frames, truths, outcomes })
 }
 
 /// The next line; `None` at the end.
@@ -133,12 +139,13 @@ fn read_line(
     let header =
         Header { hand_id, seq: line.seq, stamp_nanos: line.stamp_nanos, epoch: line.epoch, ..Header::default() };
     if line.topic == GraspTruth::TOPIC {
-        let truth: TruthLine = serde_json::from_value(line.data)
+        let message = serde_json::from_value(line.data)
             .context("not a label: expected grasp_id, epsilon, volume, stable, object and object_class")?;
-        let TruthLine { grasp_id, epsilon, volume, stable, object, object_class } = truth;
-        let [epsilon, volume] = [epsilon, volume].map(|number| number.unwrap_or(f64::NAN));
-        let message = GraspTruth { grasp_id, epsilon, volume, stable, object, object_class };
         return Ok(Line::Truth(Stamped { header, message }));
+    }
+    if line.topic == LiftOutcome::TOPIC {
+        let message = serde_json::from_value(line.data).context("not an outcome: expected the fields of LiftOutcome")?;
+        return Ok(Line::Outcome(Stamped { header, message }));
     }
     if line.topic != TactileFrame::TOPIC {
         return Ok(Line::Other);
@@ -213,19 +220,6 @@ struct FrameLine {
     senses: OwnedSenses,
     #[serde(default)]
     day: u32,
-}
-
-/// A label as lines of JSON have it.
-#[derive(Deserialize)]
-struct TruthLine {
-    grasp_id: u64,
-    epsilon: Option<f64>,
-    volume: Option<f64>,
-    stable: bool,
-    object: String,
-    /// Lines of earlier versions name it `class`.
-    #[serde(alias = "class")]
-    object_class: String,
 }
 
 fn numbers(values: Vec<Option<f64>>) -> Vec<f64> {

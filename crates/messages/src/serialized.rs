@@ -28,6 +28,14 @@ pub mod hex_id {
     }
 }
 
+/// A number that is not finite is null in JSON.
+pub(crate) fn nan_for_null<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
+    if deserializer.is_human_readable() {
+        return Ok(Option::deserialize(deserializer)?.unwrap_or(f64::NAN));
+    }
+    f64::deserialize(deserializer)
+}
+
 /// The most memory that a list takes before its items are read: no list of a message is longer.
 const MAX_RESERVED_BYTES: usize = 64 << 10;
 

@@ -128,9 +128,9 @@ fn import_lines(arguments: &Arguments, hand: &Hand) -> anyhow::Result<Outcome> {
     // Stdin has no name.
     let inputs: &[PathBuf] = if arguments.table.is_file() { std::slice::from_ref(&arguments.table) } else { &[] };
     check_new(&arguments.out, inputs, arguments.overwrite)?;
-    let FrameLines { frames, truths, headers_of_truths } = read_frames(&arguments.table, hand)?;
+    let FrameLines { frames, truths, outcomes } = read_frames(&arguments.table, hand)?;
     let name = file_name(&arguments.table);
-    let report = import_frames(&name, hand, &frames, (&truths, &headers_of_truths), &arguments.out)?;
+    let report = import_frames(&name, hand, &frames, &truths, &outcomes, &arguments.out)?;
     if arguments.json {
         print_text(&serde_json::to_string_pretty(&report)?)?;
         return Ok(Outcome::Done);

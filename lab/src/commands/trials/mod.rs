@@ -150,7 +150,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     }
     // It also ends the work after the graph.
     let n_stops = stop_requests()?;
-    let mut report = empty_report(arguments, &setup);
+    let mut report = empty_report(arguments, &setup)?;
     let mut is_lossy = false;
     let mut failed = None;
     for way in ways(arguments.lift_policy) {
@@ -206,8 +206,8 @@ fn check_arguments(arguments: &Arguments) -> anyhow::Result<()> {
     arguments.report.as_ref().map_or(Ok(()), |report| check_page(report, &[]))
 }
 
-fn empty_report(arguments: &Arguments, setup: &Setup) -> TrialsReport {
-    TrialsReport {
+fn empty_report(arguments: &Arguments, setup: &Setup) -> anyhow::Result<TrialsReport> {
+    Ok(TrialsReport {
         command: command_line(),
         objects: arguments.objects.clone(),
         n_trials: arguments.trials,
@@ -216,9 +216,10 @@ fn empty_report(arguments: &Arguments, setup: &Setup) -> TrialsReport {
         shard: arguments.shard.map(|shard| (shard.idx, shard.n)),
         options: setup.options.clone(),
         model: setup.model.clone(),
+        graph_id: setup.graph_id()?,
         end: "finished".into(),
         ..TrialsReport::default()
-    }
+    })
 }
 
 /// The ways to make the trials, in the order in which they are run.

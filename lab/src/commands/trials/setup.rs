@@ -1,5 +1,6 @@
 //! The graph of trials: the node that lifts, and the params of the nodes.
 
+use std::hash::{DefaultHasher, Hash as _, Hasher as _};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
@@ -109,6 +110,20 @@ impl Setup {
         }
         let model = PathBuf::from(&model).file_name().map_or(model, |name| name.to_string_lossy().into_owned());
         Ok(Setup { node: node.id.clone(), judges, file, overrides, hand, options, model, prior, probe })
+    }
+
+    /// Tells graphs apart that decide or lift otherwise: a digest of the params of all nodes, and of the files that they name.
+    pub(super) fn graph_id(&self) -> anyhow::Result<u64> {
+        let graph = self.graph(Way { obeys: true, name: "" })?;
+        let mut hasher = DefaultHasher::new();
+        for node in &graph.nodes {
+            for (param, value) in node.params.iter().filter(|(param, _)| *param != "shard") {
+                let file = value.as_str().filter(|text| Path::new(text).is_file());
+                let content = file.map_or_else(|| Ok(value.to_string().into_bytes()), std::fs::read)?;
+                (&node.id, param, content).hash(&mut hasher);
+            }
+        }
+        Ok(hasher.finish())
     }
 
     /// The checked graph of a way.

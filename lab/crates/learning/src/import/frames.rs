@@ -7,7 +7,7 @@ use serde::Serialize;
 
 use super::{ImportError, require_forces};
 use blindgrasp_grasps::shown_hand::shown_hand;
-use blindgrasp_messages::{GraspTruth, Header, Phase, Record, Recorded, Stamped, TactileFrame};
+use blindgrasp_messages::{GraspTruth, Header, LiftOutcome, Phase, Record, Recorded, Stamped, TactileFrame};
 use blindgrasp_recording::{RecordingInfo, RecordingWriter};
 use blindgrasp_stages::hand::Hand;
 
@@ -26,7 +26,7 @@ pub struct FramesReport {
     pub senses: Vec<String>,
 }
 
-/// Writes frames and the labels of their grasps to a recording at `out`. A label has its own header if it is
+/// Writes frames, and the labels and outcomes of their grasps, to a recording at `out`. A label has its own header if it is
 /// given, else stamp and epoch of its grasp's first frame. `name` says where they are from. After an error there is no recording.
 ///
 /// # Errors
@@ -35,7 +35,8 @@ pub fn import_frames(
     name: &str,
     hand: &Hand,
     frames: &[Stamped<TactileFrame>],
-    (truths, headers_of_truths): (&BTreeMap<u64, GraspTruth>, &BTreeMap<u64, Header>),
+    truths: &BTreeMap<u64, (Option<Header>, GraspTruth)>,
+    lifts: &[Stamped<LiftOutcome>],
     out: &Path,
 ) -> Result<FramesReport, ImportError> {
     let refused = |message: String| ImportError::Table { path: name.into(), message };
@@ -69,15 +70,18 @@ pub fn import_frames(
         recording.write_record(TactileFrame::TOPIC, &Record::Tactile(frame.clone()))?;
     }
     let mut seq = 0;
-    for (grasp_id, truth) in truths {
+    for (grasp_id, (own, truth)) in truths {
         let Some(first) = seen.get(grasp_id) else { continue };
         outcomes.insert(grasp_id, truth.stable);
-        let header = match headers_of_truths.get(grasp_id) {
-            Some(own) => Header { hand_id: hand.id(), ..*own },
-            None => Header { seq, ..*first },
-        };
+        let header = own.map_or(Header { seq, ..*first }, |own| Header { hand_id: hand.id(), ..own });
         seq += 1;
         recording.write(GraspTruth::TOPIC, &Stamped { header, message: truth.clone() })?;
+    }
+    for lift in lifts.iter().filter(|lift| seen.contains_key(&lift.message.grasp_id)) {
+        if lift.message.lifted {
+            outcomes.insert(&lift.message.grasp_id, lift.message.held);
+        }
+        recording.write(LiftOutcome::TOPIC, lift)?;
     }
     recording.finish()?;
     let n_kept = outcomes.values().filter(|is_kept| **is_kept).count();
@@ -87,7 +91,7 @@ pub fn import_frames(
         n_frames: frames.len(),
         n_kept,
         n_dropped: outcomes.len() - n_kept,
-        n_objects: truths.values().map(|truth| &truth.object).collect::<BTreeSet<_>>().len(),
+        n_objects: truths.values().map(|(_, truth)| &truth.object).collect::<BTreeSet<_>>().len(),
         senses: senses.unwrap_or_default().into_iter().map(String::from).collect(),
     })
 }

@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 use super::late_decisions::LateDecisions;
 use super::tally::{GateEffect, Tallies, Tally, TrialRecord};
 use crate::evaluation::statistics::Estimate;
+use blindgrasp_messages::hex_id;
 use blindgrasp_simulator::trial::TrialOptions;
 use blindgrasp_simulator::trial::targets::{N_PAPER_TRIALS_EACH, held_in_paper};
 use blindgrasp_simulator::wrench_space::{STABLE_EPSILON, STABLE_VOLUME};
@@ -31,6 +32,9 @@ pub struct TrialsReport {
     pub options: TrialOptions,
     /// File of the model that decided.
     pub model: String,
+    /// Equal for graphs that decide and lift alike: see `trials --merge`.
+    #[serde(default, with = "hex_id")]
+    pub graph_id: u64,
     /// `finished`, or `stopped` before all was done.
     pub end: String,
     /// With the gate: lifted when the graph said so.
@@ -87,8 +91,8 @@ impl TrialsReport {
             };
             if !known.is_of_run(&report) {
                 return Err(format!(
-                    "shard {idx}/{n} is of another run: expected the same objects, trials, attempts, seed, options, model, lift \
-                     policy and number of shards"
+                    "shard {idx}/{n} is of another run: expected the same objects, trials, attempts, seed, options, model, \
+                     params of the graph, lift policy and number of shards"
                 ));
             }
             if let (Some(late), Some(more)) = (&mut known.late, report.late) {
@@ -113,7 +117,8 @@ impl TrialsReport {
     fn is_of_run(&self, other: &TrialsReport) -> bool {
         let [ours, theirs] = [self, other].map(|report| {
             let n_shards = report.shard.map(|(_, n)| n);
-            let numbers = (n_shards, report.n_trials, report.max_attempts, report.seed, report.late.is_some());
+            let numbers =
+                (n_shards, report.n_trials, report.max_attempts, report.seed, report.graph_id, report.late.is_some());
             (numbers, &report.objects, &report.model, &report.options)
         });
         // A shard without an attempt does not tell which ways were run.
@@ -473,6 +478,7 @@ pub(super) mod tests {
         assert_eq!(text(&merged), text(&whole));
         let other = TrialsReport { seed: 2, ..shard(0) };
         let one_way = TrialsReport { records_without_gate: Vec::new(), ..shard(0) };
+        let other_graph = TrialsReport { graph_id: 7, ..shard(0) };
         let stopped = TrialsReport { end: "stopped".into(), ..shard(0) };
         for (shards, says) in [
             (vec![], "found none"),
@@ -481,6 +487,7 @@ pub(super) mod tests {
             (vec![shard(1), shard(1)], "1/2 is there twice"),
             (vec![shard(1), other], "0/2 is of another run"),
             (vec![shard(1), one_way], "0/2 is of another run"),
+            (vec![shard(1), other_graph], "0/2 is of another run"),
             (vec![shard(1), stopped], "0/2 was stopped"),
         ] {
             let refused = TrialsReport::merge(shards).expect_err(says);
