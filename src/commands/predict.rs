@@ -93,7 +93,12 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
             let read = read_frames(file, &hand)?;
             let mut judge = Judge::with_options(hand, model.clone(), options)?;
             for decided in decide_frames(&mut judge, &read.frames) {
-                print(arguments.json, file, &decided, read.truths.get(&decided.decision.grasp_id).map(|(_, truth)| truth))?;
+                print(
+                    arguments.json,
+                    file,
+                    &decided,
+                    read.truths.get(&decided.decision.grasp_id).map(|(_, truth)| truth),
+                )?;
             }
         }
     }

@@ -144,7 +144,8 @@ fn read_line(
         return Ok(Line::Truth(Stamped { header, message }));
     }
     if line.topic == LiftOutcome::TOPIC {
-        let message = serde_json::from_value(line.data).context("not an outcome: expected the fields of LiftOutcome")?;
+        let message =
+            serde_json::from_value(line.data).context("not an outcome: expected the fields of LiftOutcome")?;
         return Ok(Line::Outcome(Stamped { header, message }));
     }
     if line.topic != TactileFrame::TOPIC {

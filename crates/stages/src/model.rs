@@ -331,7 +331,7 @@ impl Model {
         let trees = match &self.classifier.predictor {
             Predictor::Boosting(trees) => trees,
             Predictor::Blend(blend) => &blend.trees,
-            Predictor::Svm(_) => return None,
+            Predictor::Svm(_) | Predictor::Loads(_) => return None,
         };
         if self.day.is_some() || values.len() != trees.n_features || names.len() != values.len() {
             return None;

@@ -32,6 +32,8 @@ pub enum Learner {
     Boosting(BoostingParams),
     /// Both; their decision values are added.
     Blend(BlendParams),
+    /// None: the rule of a hand that no grasp has taught.
+    Loads,
 }
 
 /// Boosted trees and a support vector machine side by side.

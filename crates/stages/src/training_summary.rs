@@ -11,7 +11,7 @@ use crate::own_lifts::{Correction, attempts_per_kept};
 use crate::recipe::Recipe;
 
 /// How a model was trained.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TrainingSummary {
     pub recordings: Vec<String>,

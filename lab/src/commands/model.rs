@@ -9,6 +9,7 @@ use serde_json::json;
 use super::train::{is_of_the_papers_label, probe_lines, threshold_line};
 use super::{Outcome, check_new, completions, number_in, percent, print_line, print_text};
 use blindgrasp_grasps::dataset::{hand_of, label_line};
+use blindgrasp_learning::plain_rule::plain_rule;
 use blindgrasp_learning::training::adapt;
 use blindgrasp_messages::Phase;
 use blindgrasp_operator::text::counted;
@@ -17,10 +18,12 @@ use blindgrasp_stages::classifier::boosting::BoostedTrees;
 use blindgrasp_stages::classifier::svm::RbfSvm;
 use blindgrasp_stages::classifier::{Blend, Predictor};
 use blindgrasp_stages::day::{Baseline, DayMethod};
+use blindgrasp_stages::hand::{CellUnit, Hand};
 use blindgrasp_stages::model::Model;
+use blindgrasp_stages::out_of_distribution::TrainingRange;
 use blindgrasp_stages::own_lifts::Correction;
 use blindgrasp_stages::probe::ProbeModel;
-use blindgrasp_stages::training_summary::{OwnLiftsSummary, Promise, RobotLifts, ThresholdPoint};
+use blindgrasp_stages::training_summary::{OwnLiftsSummary, Promise, RobotLifts, ThresholdPoint, TrainingSummary};
 
 /// Describe or adapt a model, or rate approaches
 #[derive(Debug, Args)]
@@ -33,6 +36,7 @@ pub(super) struct Arguments {
 enum Command {
     Show(ShowArguments),
     Adapt(AdaptArguments),
+    Rule(RuleArguments),
     Approaches(super::approaches::Arguments),
 }
 
@@ -65,6 +69,28 @@ struct AdaptArguments {
     overwrite: bool,
 }
 
+/// Make the model of a hand that has none yet: a plain rule, which needs no training.
+///
+/// Of a grasp that two fingers feel it asks for a test lift, and it lifts if they then feel enough together. Nothing is promised.
+/// After 20 lifts or more, blindgrasp model adapt corrects it by the robot's own outcomes; blindgrasp learn trains a better one.
+#[derive(Debug, Args)]
+#[command(after_help = "Example: blindgrasp model rule --hand my-hand.yaml --out rule.json\n         \
+                        blindgrasp run dataflow-live.yaml --set hand=my-hand.yaml --set model=rule.json")]
+struct RuleArguments {
+    /// Pad layout (YAML) of the hand, or the name of a built-in one. Its cells read newtons.
+    #[arg(long, add = completions::hands())]
+    hand: PathBuf,
+    /// The least load of all pads together after the test lift.
+    #[arg(long, default_value_t = 10.0, value_parser = |text: &str| number_in(text, 0.0..=1e4))]
+    newtons: f64,
+    /// Where to write the model.
+    #[arg(short, long)]
+    out: PathBuf,
+    /// Replace a file of this name
+    #[arg(long)]
+    overwrite: bool,
+}
+
 /// Print what a model is made of: all but its support vectors and the identities of its training grasps.
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:\n  \
@@ -85,8 +111,23 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     match &arguments.command {
         Command::Show(arguments) => show(arguments),
         Command::Adapt(arguments) => adapt_model(arguments),
+        Command::Rule(arguments) => make_rule(arguments),
         Command::Approaches(arguments) => super::approaches::run(arguments),
     }
+}
+
+fn make_rule(arguments: &RuleArguments) -> anyhow::Result<Outcome> {
+    let RuleArguments { hand, newtons, out, overwrite } = arguments;
+    let hand = Hand::load(hand)?;
+    check_new(out, &[], *overwrite)?;
+    if hand.cell_unit != CellUnit::Newtons {
+        bail!("--hand: the cells of {} read {}, and the rule needs newtons", hand.name, hand.cell_unit.word());
+    }
+    let model = plain_rule(&hand, *newtons, format!("model rule --newtons {newtons}"))?;
+    model.save(out)?;
+    let rule = model.look(Phase::TestLifted).map(|look| look.predictor.summary()).unwrap_or_default();
+    print_text(&format!("{}: {rule}, after a test lift", out.display()))?;
+    Ok(Outcome::Done)
 }
 
 fn adapt_model(arguments: &AdaptArguments) -> anyhow::Result<Outcome> {
@@ -324,6 +365,29 @@ fn described(model: &Model) -> Vec<(&'static str, String)> {
         ("predictor", classifier.predictor.summary()),
         ("calibration", format!("Platt, a {:.4}, b {:.4}", classifier.calibration.a, classifier.calibration.b)),
         ("threshold", threshold_line(classifier)),
+        ("checksum", model.checksum.clone()),
+    ];
+    if training.n_grasps > 0 {
+        described.extend(of_training(training, training_range));
+    }
+    let optional = [
+        ("label", label_line(&training.labels)),
+        ("day", day_line(model)),
+        ("recalibrated", recalibration_line(model)),
+    ];
+    for (name, line) in optional {
+        described.extend(line.map(|line| (name, line)));
+    }
+    for (reason, n) in &training.n_excluded {
+        described.push(("left out", format!("{n} with {reason}")));
+    }
+    described.extend(own_lifts_lines(model).into_iter().map(|line| ("adapted", line)));
+    described
+}
+
+/// The properties that the training grasps gave a model.
+fn of_training(training: &TrainingSummary, training_range: &TrainingRange) -> Vec<(&'static str, String)> {
+    vec![
         (
             "training range",
             format!(
@@ -358,21 +422,7 @@ fn described(model: &Model) -> Vec<(&'static str, String)> {
                 training.cross_validated_brier, training.cross_validated_ece
             ),
         ),
-        ("checksum", model.checksum.clone()),
-    ];
-    let optional = [
-        ("label", label_line(&training.labels)),
-        ("day", day_line(model)),
-        ("recalibrated", recalibration_line(model)),
-    ];
-    for (name, line) in optional {
-        described.extend(line.map(|line| (name, line)));
-    }
-    for (reason, n) in &training.n_excluded {
-        described.push(("left out", format!("{n} with {reason}")));
-    }
-    described.extend(own_lifts_lines(model).into_iter().map(|line| ("adapted", line)));
-    described
+    ]
 }
 
 /// The size and parameters of a predictor, without its support vectors or nodes.
@@ -380,6 +430,7 @@ fn predictor_json(predictor: &Predictor) -> serde_json::Value {
     match predictor {
         Predictor::Svm(svm) => svm_json(svm),
         Predictor::Boosting(trees) => trees_json(trees),
+        Predictor::Loads(rule) => json!({ "kind": "loads", "rule": rule }),
         Predictor::Blend(Blend { trees, svm, svm_weight }) => json!({
             "kind": "blend",
             "boosting": trees_json(trees),

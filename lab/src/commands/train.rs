@@ -186,7 +186,7 @@ fn recipe(arguments: &Arguments) -> anyhow::Result<Recipe> {
             params.c = arguments.c.unwrap_or(params.c);
             params.gamma = arguments.gamma.unwrap_or(params.gamma);
         }
-        Learner::Boosting(_) => {
+        Learner::Boosting(_) | Learner::Loads => {
             let given = [("--c", arguments.c), ("--gamma", arguments.gamma)];
             if let Some((name, _)) = given.iter().find(|(_, value)| value.is_some()) {
                 anyhow::bail!("{name} is the SVM's: the recipe {} has none; name another with --recipe", recipe.name);

@@ -5,6 +5,7 @@
 
 pub mod boosting;
 pub mod calibration;
+pub mod loads;
 pub mod svm;
 
 use serde::{Deserialize, Serialize};
@@ -12,6 +13,7 @@ use serde::{Deserialize, Serialize};
 use blindgrasp_messages::Fault;
 use boosting::BoostedTrees;
 use calibration::{PlattCalibration, positive_probability};
+use loads::LoadRule;
 use svm::{PreparedSvm, SvmError};
 
 /// A trained function from a feature to a decision value, above 0 on the stable side.
@@ -22,6 +24,8 @@ pub enum Predictor {
     Svm(PreparedSvm),
     Boosting(BoostedTrees),
     Blend(Blend),
+    /// Nothing is learned.
+    Loads(LoadRule),
 }
 
 /// Boosted trees and a support vector machine on the same feature.
@@ -41,6 +45,7 @@ impl Predictor {
             Predictor::Svm(svm) => svm.n_features,
             Predictor::Boosting(trees) => trees.n_features,
             Predictor::Blend(blend) => blend.trees.n_features,
+            Predictor::Loads(rule) => rule.n_features,
         }
     }
 
@@ -62,6 +67,7 @@ impl Predictor {
                 let of_svm = svm.decision_value(values).map_err(|_| Fault::InvalidValue)?;
                 Ok(trees.decision_value(values) + svm_weight * of_svm)
             }
+            Predictor::Loads(rule) => Ok(rule.decision_value(values)),
         }
     }
 
@@ -83,6 +89,7 @@ impl Predictor {
                     .map(|(trees, svm)| trees + svm_weight * svm)
                     .collect())
             }
+            Predictor::Loads(rule) => Ok(rows.chunks(rule.n_features).map(|row| rule.decision_value(row)).collect()),
         }
     }
 
@@ -97,6 +104,7 @@ impl Predictor {
         match self {
             Predictor::Svm(svm) => check_svm(svm),
             Predictor::Boosting(trees) => check_trees(trees),
+            Predictor::Loads(rule) => rule.validate(),
             Predictor::Blend(Blend { trees, svm, svm_weight }) => {
                 check_svm(svm)?;
                 check_trees(trees)?;
@@ -123,6 +131,7 @@ impl Predictor {
             Predictor::Blend(Blend { trees, svm, svm_weight }) => {
                 format!("{} + {svm_weight} x {}", of_trees(trees), of_svm(svm))
             }
+            Predictor::Loads(rule) => rule.summary(),
         }
     }
 }

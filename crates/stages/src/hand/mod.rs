@@ -436,6 +436,15 @@ impl Hand {
         hand
     }
 
+    /// The finger of a link: its first moving link behind the palm, or the palm for one that does not move against it.
+    pub fn finger_of(&self, link_idx: usize) -> usize {
+        let above = |link_idx| std::iter::successors(Some(link_idx), |idx: &usize| self.links[*idx].parent_idx);
+        let of_palm: Vec<usize> = above(self.palm_link_idx()).collect();
+        let moves = |idx: &usize| matches!(self.links[*idx].motion, Motion::Joint { .. });
+        let moving = above(link_idx).filter(|idx| !of_palm.contains(idx) && moves(idx));
+        moving.last().unwrap_or(self.palm_link_idx())
+    }
+
     /// A joint that moves the palm itself, as those of an arm do.
     pub fn joint_above_palm(&self) -> Option<&Joint> {
         let above = std::iter::successors(Some(self.palm_link()), |link| Some(&self.links[link.parent_idx?]));

@@ -15,12 +15,13 @@
 //! [`training::train`] makes such a model of the grasps of recordings, or of grasps in memory ([`training::Examples`]).
 //!
 //! * [`import`] - tables of tactile readings as recordings.
-//! * [`training`] - the model, by the [`learners`].
+//! * [`training`] - the model, by the [`learners`]. [`plain_rule`] - one that learns nothing.
 //! * [`evaluation`] - decisions compared with labels. [`promise`] - bounds for the drops to come. [`trials`] - lift trials counted and shown.
 
 pub mod evaluation;
 pub mod import;
 pub mod learners;
+pub mod plain_rule;
 pub mod promise;
 pub mod sensors;
 pub mod training;

@@ -311,6 +311,7 @@ fn about(recipe: &Recipe) -> String {
     let learner = match &recipe.learner {
         Learner::Svm(params) => format!("RBF SVM (C {}, gamma {})", params.c, params.gamma),
         Learner::Boosting(params) => format!("{} boosted trees", params.n_rounds),
+        Learner::Loads => "a plain rule".into(),
         Learner::Blend(BlendParams { boosting, svm, svm_weight }) => {
             format!("{} boosted trees + {svm_weight} x RBF SVM (C {}, gamma {})", boosting.n_rounds, svm.c, svm.gamma)
         }

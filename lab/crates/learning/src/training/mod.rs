@@ -454,6 +454,7 @@ pub fn fit(hand: &Hand, recipe: &Recipe, examples: &[&Example], seed: u64) -> Re
             let blend = Blend { trees, svm: svm.try_into()?, svm_weight: *svm_weight };
             (Predictor::Blend(blend), report.n_iterations, report.converged)
         }
+        Learner::Loads => return Err(TrainingError::Data("the rule of loads learns nothing".into())),
     };
     Ok(Fitted { features, predictor, inertia, n_iterations, converged, day_variances })
 }
