@@ -48,7 +48,7 @@ pub struct BlendParams {
 
 impl Recipe {
     /// The names of the recipes that come with the program, the default one first.
-    pub const NAMES: [&str; 7] = ["boosted", "wrist", "blend", "paper", "raw", "posture", "joints"];
+    pub const NAMES: [&str; 6] = ["boosted", "wrist", "blend", "paper", "raw", "joints"];
 
     /// A recipe by its name. The parameters are the choice of a grid search on 12,000 simulated grasps of the built-in
     /// training objects (docs/learning.md); held-out objects were not used. Those of `blend` were not searched.
@@ -82,8 +82,6 @@ impl Recipe {
             "paper" => (vec![Block::Histogram], false, svm(30.0, 0.3)),
             // The earlier work that the paper compares itself with: cells and joints.
             "raw" => (vec![Block::Cells, Block::Joints], true, svm(10.0, 0.005)),
-            // The paper's feature with the joint angles beside it.
-            "posture" => (vec![Block::Histogram, Block::Joints, Block::Breakaways], true, svm(10.0, 0.01)),
             _ => return None,
         };
         Some(Recipe { name: name.into(), blocks, scaled, learner, n_words: 64, ..Recipe::default() })

@@ -31,12 +31,7 @@ pub fn plain_rule(hand: &Hand, least_newtons: f64, made_by: String) -> Result<Mo
         Recipe { name: "loads".into(), blocks: vec![Block::Pads], learner: Learner::Loads, ..Recipe::default() };
     // No value is of the histogram.
     let features = FeatureExtractor::new(hand, &recipe.blocks, Dictionary { words_m: vec![[0.0; 3]] }, recipe.sigma_m);
-    let limits = quantities(hand).into_iter().map(|Quantity { name, possible, resolution, .. }| Limits {
-        quantity: name,
-        lower: possible.start() - resolution,
-        upper: (possible.end() + resolution).min(NO_LIMIT),
-    });
-    let training_range = TrainingRange { limits: limits.collect(), share_flagged: 0.0 };
+    let training_range = all_that_is_possible(hand);
     if loads_of_fingers(hand, &features, 0).len() < LEAST_FINGERS {
         return Err(TrainingError::Data(format!(
             "the pads of {} are on one finger, and the rule needs them on {LEAST_FINGERS}",
@@ -80,6 +75,15 @@ pub fn plain_rule(hand: &Hand, least_newtons: f64, made_by: String) -> Result<Mo
         },
         checksum: String::new(),
     })
+}
+
+fn all_that_is_possible(hand: &Hand) -> TrainingRange {
+    let limits = quantities(hand).into_iter().map(|Quantity { name, possible, resolution, .. }| Limits {
+        quantity: name,
+        lower: possible.start() - resolution,
+        upper: (possible.end() + resolution).min(NO_LIMIT),
+    });
+    TrainingRange { limits: limits.collect(), share_flagged: 0.0 }
 }
 
 /// The places of the pads' loads among values that begin with `first` others, finger by finger.
