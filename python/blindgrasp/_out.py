@@ -9,6 +9,7 @@ import importlib
 import itertools
 import json
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -19,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ._model import SENSES
 from ._program import answer_of
 from ._recording import Grasp, Recording
 from ._tables import cell_names
@@ -121,20 +123,21 @@ def from_parquet(
     """Writes the recordings of a file of `to_parquet`, or of a dataset of `to_lerobot`, to the folder `out`, and returns them.
 
     Each has the name that it had, the same frames with their numbers and times, and the same labels and outcomes; a label
-    and an outcome get the times of the grasp's first and last frame. Decisions and predictions are not written: a graph or
-    `blindgrasp predict` makes them. `hand` is the layout of a hand that is not built in.
+    and an outcome get the times of the grasp's first and last frame. Scenes, decisions and predictions are not written: a
+    graph or `blindgrasp predict` makes the last two. Columns that `to_parquet` does not write are not read. `hand` is the layout of a hand that is not built in. A recording without grasps has no
+    rows, and so does not come back.
 
-    Raises ModuleNotFoundError without pyarrow, ValueError if the source is not written so or two recordings have one name, and
-    ProgramError if the hand is another one or a file exists.
+    Raises ModuleNotFoundError without pyarrow, ValueError if the source is not written so, two recordings have one name or
+    the frames of a grasp are not together, and ProgramError if the hand is another one or a file exists.
     """
     pa = _pyarrow()
     path, folder = Path(fspath(source)), Path(fspath(out))
     folder.mkdir(parents=True, exist_ok=True)
-    rows = _rows_of_dataset(pa, path) if path.is_dir() else _rows_of_file(pa, path)
+    rows = _rows_of_dataset(pa, path) if path.is_dir() else _rows_of_file(pa, path, hand)
     recordings: list[Recording] = []
     for name, of_recording in itertools.groupby(rows, lambda row: row["recording"]):
         to = folder / name
-        if Path(name).name != name or any(to == known.path for known in recordings):
+        if name is None or Path(name).name != name or any(to == known.path for known in recordings):
             raise ValueError(f"{path}: expected the names of different files in the column recording, found {name!r}")
         with tempfile.TemporaryDirectory() as lines_in:
             lines = Path(lines_in) / name
@@ -143,20 +146,25 @@ def from_parquet(
             words = [f"--hand={layout if hand is None else fspath(hand)}", f"--out={to}", *(["--overwrite"] if overwrite else [])]
             answer_of(["import", str(lines), "--lines", "--json", *words])
         recordings.append(Recording(to))
+    if not recordings:
+        raise ValueError(f"{path}: expected frames, found none")
     return recordings
 
 
-def _rows_of_file(pa: Any, path: Path) -> Iterator[dict[str, Any]]:
+def _rows_of_file(pa: Any, path: Path, hand: str | PathLike[str] | None) -> Iterator[dict[str, Any]]:
     """Frames as dicts: the values of the grasp, `seq`, `stamp_nanos`, `phase`, and the values of each sense as a list."""
     with pa.parquet.ParquetFile(path) as file:
         found = file.schema_arrow.names
         _check(path, {*OF_GRASP, "grasp", "seq", "stamp_nanos", "phase", "predicted"}, found)
         columns: dict[str, list[str]] = {}
-        for name in found[found.index("predicted") + 1 :]:
-            sense = "cell" if name.startswith("cell_") else name.rpartition("_")[0]
-            columns.setdefault(sense, []).append(name)
+        for sense in ("joint", "cell", *SENSES):
+            numbered = [name for name in found if re.fullmatch(rf"{sense}_\d+", name)]
+            columns[sense] = sorted(numbered, key=lambda name: int(name.rpartition("_")[2]))
         for batch in file.iter_batches(1000):
             for row in batch.to_pylist():
+                if not columns["cell"]:
+                    columns["cell"] = [f"cell_{name}" for name in cell_names(row["hand"] if hand is None else fspath(hand))]
+                    _check(path, set(columns["cell"]), found)
                 yield row | {"senses": {sense: [row[name] for name in names] for sense, names in columns.items()}}
 
 
@@ -197,10 +205,11 @@ def _write_lines(rows: Iterator[dict[str, Any]], stream: Any) -> str:
         first = row = next(of_grasp)
         key = (first["epoch"], first["grasp_id"])
         if key in seen:
-            raise ValueError(f"two recordings are called {first['recording']!r}: write them to different files")
+            where = f"{first['recording']}, grasp {first['grasp_id']}"
+            raise ValueError(f"{where}: expected its frames together, and recordings with different names")
         seen.add(key)
-        if first["stable"] is not None:
-            label = {name: first[name] for name in ("stable", "epsilon", "volume")}
+        if first["stable"] in (True, False):
+            label = {"stable": bool(first["stable"]), "epsilon": first["epsilon"], "volume": first["volume"]}
             label |= {name: first[name] or "" for name in ("object", "object_class")}
             write("/truth", n_labels, first, label)
             n_labels += 1

@@ -269,13 +269,16 @@ class Recordings(Folder):
         for line in kept[:14]:
             line["data"]["cells_newtons"][3] = None
             line["data"] |= {"gravity_m_per_s2": [0.5, 0.0, -9.8], "day": 20261124}
+        # The source began anew, with the same numbers.
+        kept += [line | {"epoch": 7} for line in kept]
         own.write_text("\n".join(map(json.dumps, kept)))
         path, recording = self.folder / "frames.parquet", self.folder / "own.mcap"
         words = ["--lines", "--hand", "barrett-bh8-280", "--out"]
         subprocess.run([str(blindgrasp.program()), "import", str(own), *words, str(recording)], check=True, capture_output=True)
         grasps = blindgrasp.read(recording)
         self.assertTrue(np.isnan(grasps[0].cells_newtons[0, 3]))
-        self.assertEqual([len(grasps), [grasp.label is None for grasp in grasps].count(True)], [2, 1])
+        self.assertEqual([(grasp.epoch, grasp.label is None) for grasp in grasps].count((7, True)), 1)
+        self.assertEqual(len(grasps), 4)
         blindgrasp.to_parquet(recording, path)
         blindgrasp.to_lerobot(recording, self.folder / "dataset")
         for source in (path, self.folder / "dataset"):
@@ -285,8 +288,19 @@ class Recordings(Folder):
         copied.parent.mkdir()
         copied.write_bytes(recording.read_bytes())
         blindgrasp.to_parquet([recording, copied], path)
-        with self.assertRaisesRegex(ValueError, "two recordings are called 'own.mcap'"):
+        with self.assertRaisesRegex(ValueError, "own.mcap, grasp [01]: expected its frames together, and .* different names"):
             blindgrasp.from_parquet(path, self.folder / "twice")
+        # pandas adds an index, and a user columns.
+        blindgrasp.to_parquet(recording, path, hand="barrett-bh8-280")
+        table = pd.read_parquet(path)
+        table = table[sorted(table.columns)][table["grasp_id"] == 1].assign(note="text", weight_kg=0.5)
+        table.to_parquet(path)
+        [again] = blindgrasp.from_parquet(path, self.folder / "edited")
+        self.assert_same([grasp for grasp in grasps if grasp.grasp_id == 1], again)
+        for edited, says in ((table.head(0), "expected frames, found none"), (table.drop(columns="cell_palm_3"), "no 'cell_palm_3'")):
+            edited.to_parquet(path)
+            with self.assertRaisesRegex(ValueError, says):
+                blindgrasp.from_parquet(path, self.folder / "refused")
 
     def test_grasps_of_two_recordings_come_back_unmerged(self):
         recording, _ = self.with_an_outcome()
@@ -953,7 +967,7 @@ class Pages(Folder):
         features = pd.read_csv(self.folder / "features.csv")
         self.assertLessEqual({"stable", "object"}, set(features.columns))
         # The table has become a recording again.
-        table, again = names["table"], blindgrasp.Recording(self.folder / "grasps.mcap").to_frame()
+        table, again = names["table"], blindgrasp.Recording(self.folder / "again-dataset/held-out.mcap").to_frame()
         self.assertEqual(again["stable"].tolist(), table["stable"].tolist())
         self.assertEqual(again["object_class"].tolist(), table["object_class"].tolist())
         cells = [frame.filter(like="cell_").to_numpy() for frame in (table, again)]

@@ -93,12 +93,9 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
             let read = read_frames(file, &hand)?;
             let mut judge = Judge::with_options(hand, model.clone(), options)?;
             for decided in decide_frames(&mut judge, &read.frames) {
-                print(
-                    arguments.json,
-                    file,
-                    &decided,
-                    read.truths.get(&decided.decision.grasp_id).map(|(_, truth)| truth),
-                )?;
+                let grasp_id = decided.decision.grasp_id;
+                let known = read.truths.range((grasp_id, 0)..=(grasp_id, u64::MAX)).next();
+                print(arguments.json, file, &decided, known.map(|(_, (_, truth))| truth))?;
             }
         }
     }

@@ -25,8 +25,8 @@ const MAX_LINE_BYTES: u64 = 4 << 20;
 /// The frames of lines, and what they say of the grasps.
 pub struct FrameLines {
     pub frames: Vec<Stamped<TactileFrame>>,
-    /// The labels by grasp, with their headers if they have lines of their own.
-    pub truths: BTreeMap<u64, (Option<Header>, GraspTruth)>,
+    /// The labels by number of the grasp and epoch, with their headers if they have lines of their own.
+    pub truths: BTreeMap<(u64, u64), (Option<Header>, GraspTruth)>,
     pub outcomes: Vec<Stamped<LiftOutcome>>,
 }
 
@@ -76,18 +76,19 @@ pub fn read_frames(file: &Path, hand: &Hand) -> anyhow::Result<FrameLines> {
         }
         let truth = match read {
             Line::Frame(frame, truth) => {
+                let epoch = frame.header.epoch;
                 frames.push(frame);
-                truth.map(|truth| (None, truth))
+                truth.map(|truth| (epoch, (None, truth)))
             }
-            Line::Truth(Stamped { header, message }) => Some((Some(header), message)),
+            Line::Truth(Stamped { header, message }) => Some((header.epoch, (Some(header), message))),
             Line::Outcome(outcome) => {
                 outcomes.push(outcome);
                 None
             }
             Line::Other => None,
         };
-        if let Some(truth) = truth {
-            truths.entry(truth.1.grasp_id).or_insert(truth);
+        if let Some((epoch, truth)) = truth {
+            truths.entry((truth.1.grasp_id, epoch)).or_insert(truth);
         }
     }
     if let (Some(has_seq), Some(first)) = (has_seq, frames.first()) {

@@ -9,10 +9,10 @@ message! {
         pub grasp_id: u64,
         /// Epsilon quality: the least wrench that breaks the grasp; -1 without force closure, NaN if it was not
         /// computed.
-        #[serde(deserialize_with = "crate::serialized::nan_for_null")]
+        #[serde(default = "crate::serialized::nan", deserialize_with = "crate::serialized::nan_for_null")]
         pub epsilon: f64,
         /// Volume quality: 6-D volume of the L1 grasp wrench space; NaN if it was not computed.
-        #[serde(deserialize_with = "crate::serialized::nan_for_null")]
+        #[serde(default = "crate::serialized::nan", deserialize_with = "crate::serialized::nan_for_null")]
         pub volume: f64,
         /// Whether both exceed their thresholds; of a grasp that was lifted, whether the object was kept.
         pub stable: bool,

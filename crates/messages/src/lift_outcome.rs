@@ -21,21 +21,21 @@ message! {
         /// How far the object's centre of mass moved in the hand since the hand had settled. Of a dropped object it
         /// counts until that was lost; after a test lift without a lift, until it was set down. Otherwise it is 0 if the
         /// object was not lifted.
-        #[serde(deserialize_with = "crate::serialized::nan_for_null")]
+        #[serde(default = "crate::serialized::nan", deserialize_with = "crate::serialized::nan_for_null")]
         pub slip_m: f64,
         /// How far the object turned in the hand.
-        #[serde(deserialize_with = "crate::serialized::nan_for_null")]
+        #[serde(default = "crate::serialized::nan", deserialize_with = "crate::serialized::nan_for_null")]
         pub turn_rad: f64,
         /// Epsilon quality of the settled grasp; -1 without force closure.
-        #[serde(deserialize_with = "crate::serialized::nan_for_null")]
+        #[serde(default = "crate::serialized::nan", deserialize_with = "crate::serialized::nan_for_null")]
         pub epsilon: f64,
         /// Volume quality of the settled grasp.
-        #[serde(deserialize_with = "crate::serialized::nan_for_null")]
+        #[serde(default = "crate::serialized::nan", deserialize_with = "crate::serialized::nan_for_null")]
         pub volume: f64,
-        #[serde(deserialize_with = "crate::serialized::nan_for_null")]
+        #[serde(default = "crate::serialized::nan", deserialize_with = "crate::serialized::nan_for_null")]
         pub mass_kg: f64,
         /// Coulomb friction of the object's surface on the hand.
-        #[serde(deserialize_with = "crate::serialized::nan_for_null")]
+        #[serde(default = "crate::serialized::nan", deserialize_with = "crate::serialized::nan_for_null")]
         pub friction: f64,
         /// The name of the object to lift.
         #[max(MAX_NAME_BYTES)]

@@ -28,6 +28,11 @@ pub mod hex_id {
     }
 }
 
+/// The value of a number that JSON does not have.
+pub(crate) fn nan() -> f64 {
+    f64::NAN
+}
+
 /// A number that is not finite is null in JSON.
 pub(crate) fn nan_for_null<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
     if deserializer.is_human_readable() {

@@ -15,7 +15,7 @@ def arguments():
 
 
 def ended_by_signals(work):
-    """Decorates the work of a node: it begins with ROS 2, and a signal ends it at any moment without an error."""
+    """Decorates the work of a node: ROS 2 begins, and from then on a signal ends the work without an error."""
 
     @functools.wraps(work)
     def begin(*of):

@@ -71,17 +71,18 @@ struct AdaptArguments {
 
 /// Make the model of a hand that has none yet: a plain rule, which needs no training.
 ///
-/// Of a grasp that two fingers feel it asks for a test lift, and it lifts if they then feel enough together. Nothing is promised.
+/// Of a grasp that two of the fingers and the palm feel it asks for a test lift, and it lifts if they then feel enough together.
+/// Nothing is promised.
 /// After 20 lifts or more, blindgrasp model adapt corrects it by the robot's own outcomes; blindgrasp learn trains a better one.
 #[derive(Debug, Args)]
 #[command(after_help = "Example: blindgrasp model rule --hand my-hand.yaml --out rule.json\n         \
-                        blindgrasp run dataflow-live.yaml --set hand=my-hand.yaml --set model=rule.json")]
+                        blindgrasp run dataflow-live.yaml --set hand=my-hand.yaml --set model=rule.json \\\n             --set promised_drops=1")]
 struct RuleArguments {
     /// Pad layout (YAML) of the hand, or the name of a built-in one. Its cells read newtons.
     #[arg(long, add = completions::hands())]
     hand: PathBuf,
     /// The least load of all pads together after the test lift.
-    #[arg(long, default_value_t = 10.0, value_parser = |text: &str| number_in(text, 0.0..=1e4))]
+    #[arg(long, default_value_t = 10.0, allow_negative_numbers = true, value_parser = |text: &str| number_in(text, 0.0..=1e4))]
     newtons: f64,
     /// Where to write the model.
     #[arg(short, long)]

@@ -13,7 +13,7 @@ use blindgrasp_learning::training::{Aim, Examples, TrainingOptions, TrainingSumm
 use blindgrasp_messages::Fault;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_recording::recordings_in;
-use blindgrasp_stages::classifier::Classifier;
+use blindgrasp_stages::classifier::{Classifier, Predictor};
 use blindgrasp_stages::label::Label;
 use blindgrasp_stages::model::Model;
 use blindgrasp_stages::recipe::{BlendParams, Learner, Recipe};
@@ -38,7 +38,7 @@ pub(super) struct Arguments {
     hand: Option<PathBuf>,
     /// The features and the learner: boosted (the histogram, pads and joints, boosted trees), wrist (the same with gravity
     /// and the load on the wrist), blend (cells and joints, boosted trees and an SVM), paper (the histogram, an SVM), raw (cells
-    /// and joints, an SVM), posture (the histogram and joints, an SVM), joints (no touch, boosted trees).
+    /// and joints, an SVM), joints (no touch, boosted trees).
     #[arg(long, default_value = "boosted", value_parser = Recipe::NAMES)]
     recipe: String,
     /// Judge each value relative to the grasps of its recording day before it, for sensors that drift from day to day. The
@@ -124,7 +124,11 @@ pub(super) fn probe_lines(model: &Model) -> Vec<String> {
     let mut lines = Vec::new();
     for (name, probe) in [("squeezed", &model.squeezed), ("test-lifted", &model.test_lifted)] {
         lines.extend(probe.as_ref().map(|probe| {
-            format!("{name}: calibration error {:.4}, {}", probe.cross_validated_ece, threshold_line(&probe.classifier))
+            let about = match &probe.classifier.predictor {
+                Predictor::Loads(rule) => rule.summary(),
+                _ => format!("calibration error {:.4}", probe.cross_validated_ece),
+            };
+            format!("{name}: {about}, {}", threshold_line(&probe.classifier))
         }));
     }
     lines.extend(

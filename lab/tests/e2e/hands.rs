@@ -458,11 +458,11 @@ fn a_jaw_closes_on_a_fixed_one() {
     assert!(layout.contains("normal: [-1, 0, 0]") && layout.contains("normal: [1, 0, 0]"), "{layout}");
     // Until it has a model of its own, a plain rule is one.
     let rule = ["model", "rule", "--hand", "other/other.yaml", "--newtons", "4", "--out", "rule.json"];
-    let says = "a plain rule: 2 of 2 fingers feel, together 4 newtons or more";
+    let says = "a plain rule: 2 of 2 (fingers, palm) feel, together 4 newtons or more";
     let (stdout, _) = run_in(folder.path(), &rule, 0);
     assert!(stdout.contains(says), "{stdout}");
     let (shown, _) = run_in(folder.path(), &["model", "show", "rule.json", "--json"], 0);
     assert!(shown.contains("\"kind\": \"loads\"") && shown.contains("\"least_newtons\": 4.0"), "{shown}");
     let (shown, _) = run_in(folder.path(), &["model", "show", "rule.json"], 0);
-    assert!(!shown.contains("trained on"), "{shown}");
+    assert!(!shown.contains("trained on") && shown.contains(&format!("test-lifted: {says}")), "{shown}");
 }

@@ -524,7 +524,8 @@ impl<S: Surroundings> Lifecycle<S> {
     pub(super) fn on_end(&mut self, id: u64, status: ExitStatus, sample: Option<SampleId>) {
         let is_memory_full = self.site.is_memory_full();
         let death = Death { at: self.now, status: Some(status), sample, is_memory_full };
-        if !status.success() {
+        let is_asked = self.instances_mut().any(|instance| instance.id == id && instance.is_asked);
+        if !(status.success() && is_asked) {
             // Until then its neighbours count its ports among those that live.
             self.site.reap();
         }

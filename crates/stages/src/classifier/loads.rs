@@ -1,4 +1,5 @@
-//! A plain rule in the place of a learned function: several fingers feel the object, and together they feel enough.
+//! A plain rule in the place of a learned function: several fingers feel the object, and together they feel enough. The palm
+//! counts as a finger.
 
 use serde::{Deserialize, Serialize};
 
@@ -47,7 +48,7 @@ impl LoadRule {
     /// A short description for people.
     pub fn summary(&self) -> String {
         format!(
-            "a plain rule: {} of {} fingers feel, together {} newtons or more",
+            "a plain rule: {} of {} (fingers, palm) feel, together {} newtons or more",
             self.least_fingers,
             self.fingers.len(),
             self.least_newtons

@@ -112,7 +112,7 @@ impl Setup {
         Ok(Setup { node: node.id.clone(), judges, file, overrides, hand, options, model, prior, probe })
     }
 
-    /// Tells graphs apart that decide or lift otherwise: a digest of the params of all nodes, and of the files that they name.
+    /// A digest of the params of all nodes, and of the files that they name: equal in all shards of a run.
     pub(super) fn graph_id(&self) -> anyhow::Result<u64> {
         let graph = self.graph(Way { obeys: true, name: "" })?;
         let mut hasher = DefaultHasher::new();

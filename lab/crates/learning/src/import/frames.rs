@@ -8,8 +8,11 @@ use serde::Serialize;
 use super::{ImportError, require_forces};
 use blindgrasp_grasps::shown_hand::shown_hand;
 use blindgrasp_messages::{GraspTruth, Header, LiftOutcome, Phase, Record, Recorded, Stamped, TactileFrame};
-use blindgrasp_recording::{RecordingInfo, RecordingWriter};
+use blindgrasp_recording::{RecordingError, RecordingInfo, RecordingWriter};
 use blindgrasp_stages::hand::Hand;
+
+/// Number and epoch of a grasp.
+type GraspKey = (u64, u64);
 
 /// The report of an import of frames.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
@@ -35,7 +38,7 @@ pub fn import_frames(
     name: &str,
     hand: &Hand,
     frames: &[Stamped<TactileFrame>],
-    truths: &BTreeMap<u64, (Option<Header>, GraspTruth)>,
+    truths: &BTreeMap<GraspKey, (Option<Header>, GraspTruth)>,
     lifts: &[Stamped<LiftOutcome>],
     out: &Path,
 ) -> Result<FramesReport, ImportError> {
@@ -56,33 +59,21 @@ pub fn import_frames(
     for frame in frames {
         let TactileFrame { grasp_id, phase, .. } = &frame.message;
         let place = format!("grasp {grasp_id}, frame {} ({})", frame.header.seq, phase.as_str());
+        let key = (*grasp_id, frame.header.epoch);
         check_frame(hand, frame).map_err(|problem| refused(format!("{place}: {problem}")))?;
-        if last.replace(grasp_id) != Some(grasp_id) && seen.insert(grasp_id, frame.header).is_some() {
+        if last.replace(key) != Some(key) && seen.insert(key, frame.header).is_some() {
             return Err(refused(format!(
                 "{place}: frames of another grasp come before it; expected each grasp's together"
             )));
         }
         if matches!(phase, Phase::Kept | Phase::Dropped) {
-            outcomes.entry(grasp_id).or_insert(*phase == Phase::Kept);
+            outcomes.entry(key).or_insert(*phase == Phase::Kept);
         }
         let has = senses_of(&frame.message);
         senses = Some(senses.map_or(has.clone(), |known| &known & &has));
         recording.write_record(TactileFrame::TOPIC, &Record::Tactile(frame.clone()))?;
     }
-    let mut seq = 0;
-    for (grasp_id, (own, truth)) in truths {
-        let Some(first) = seen.get(grasp_id) else { continue };
-        outcomes.insert(grasp_id, truth.stable);
-        let header = own.map_or(Header { seq, ..*first }, |own| Header { hand_id: hand.id(), ..own });
-        seq += 1;
-        recording.write(GraspTruth::TOPIC, &Stamped { header, message: truth.clone() })?;
-    }
-    for lift in lifts.iter().filter(|lift| seen.contains_key(&lift.message.grasp_id)) {
-        if lift.message.lifted {
-            outcomes.insert(&lift.message.grasp_id, lift.message.held);
-        }
-        recording.write(LiftOutcome::TOPIC, lift)?;
-    }
+    outcomes.extend(write_known(&mut recording, hand, &seen, truths, lifts)?);
     recording.finish()?;
     let n_kept = outcomes.values().filter(|is_kept| **is_kept).count();
     Ok(FramesReport {
@@ -94,6 +85,37 @@ pub fn import_frames(
         n_objects: truths.values().map(|(_, truth)| &truth.object).collect::<BTreeSet<_>>().len(),
         senses: senses.unwrap_or_default().into_iter().map(String::from).collect(),
     })
+}
+
+/// Writes the labels and the outcomes of grasps whose first frames have these headers. Returns which grasps hold.
+fn write_known(
+    recording: &mut RecordingWriter,
+    hand: &Hand,
+    seen: &BTreeMap<GraspKey, Header>,
+    truths: &BTreeMap<GraspKey, (Option<Header>, GraspTruth)>,
+    lifts: &[Stamped<LiftOutcome>],
+) -> Result<BTreeMap<GraspKey, bool>, RecordingError> {
+    let mut outcomes = BTreeMap::new();
+    let mut seq = 0;
+    for (key, (own, truth)) in truths {
+        let Some(first) = seen.get(key) else { continue };
+        outcomes.insert(*key, truth.stable);
+        let header = own.map_or(Header { seq, ..*first }, |own| Header { hand_id: hand.id(), ..own });
+        seq += 1;
+        recording.write(GraspTruth::TOPIC, &Stamped { header, message: truth.clone() })?;
+    }
+    for Stamped { header, message } in lifts {
+        let key = (message.grasp_id, header.epoch);
+        if !seen.contains_key(&key) {
+            continue;
+        }
+        if message.lifted {
+            outcomes.insert(key, message.held);
+        }
+        let header = Header { hand_id: hand.id(), ..*header };
+        recording.write(LiftOutcome::TOPIC, &Stamped { header, message: message.clone() })?;
+    }
+    Ok(outcomes)
 }
 
 /// Refuses a frame that is not of this hand, with the reason.

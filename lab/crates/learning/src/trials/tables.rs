@@ -32,7 +32,7 @@ pub struct TrialsReport {
     pub options: TrialOptions,
     /// File of the model that decided.
     pub model: String,
-    /// Equal for graphs that decide and lift alike: see `trials --merge`.
+    /// A digest of the graph's params, by which `trials --merge` tells runs apart.
     #[serde(default, with = "hex_id")]
     pub graph_id: u64,
     /// `finished`, or `stopped` before all was done.
