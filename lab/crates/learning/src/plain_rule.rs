@@ -105,14 +105,16 @@ mod tests {
     use blindgrasp_stages::encoder::FeltReading;
     use blindgrasp_stages::model::Memory;
 
+    /// A phase, what its pads feel, newtons, and whether the grasp is stable or unsure then.
+    type Look<'a> = (Phase, &'a [f64], Option<(bool, bool)>);
+
     #[test]
     fn a_grasp_of_two_fingers_is_tried_and_is_lifted_if_they_bear_enough() {
         let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
         let model = plain_rule(&hand, 10.0, "a test".into()).expect("a model");
         let pads: Vec<&str> = hand.pads.iter().map(|pad| pad.name.as_str()).collect();
         assert_eq!(pads.len(), 4, "the palm and three fingers: {pads:?}");
-        // Each phase with what its pads feel, newtons, and whether the grasp is stable or unsure then.
-        let judge = |looks: &[(Phase, &[f64], Option<(bool, bool)>)]| {
+        let judge = |looks: &[Look<'_>]| {
             let mut memory = Memory::default();
             for (phase, newtons, expected) in looks {
                 let contact = |(pad, force): (usize, &f64)| Contact {
