@@ -34,6 +34,8 @@ OUTCOME = {
     "turn_rad": "float64", "epsilon": "float64", "volume": "float64", "mass_kg": "float64", "friction": "float64",
     "thing": "string", "group": "string", "probed": "bool", "disturbed": "bool",
 }  # fmt: skip
+# pandas makes floats of numbers and booleans beside missing ones.
+AS_KIND: dict[str, Any] = {"bool": bool, "uint64": lambda value: int(value or 0), "float64": lambda value: value, "string": lambda value: value or ""}
 # What is equal for all frames of a grasp.
 OF_GRASP = {
     "recording": "string", "hand": "string", "hand_id": "string", "model": "string", "day": "int64", "epoch": "uint64",
@@ -57,7 +59,7 @@ def to_parquet(
     grasp: `recording`, `hand`, `hand_id`, `model`, `day`, `epoch`, `grasp_id`, and its label, decision and outcome; then
     `grasp` (its running number in the file), `seq`, `stamp_nanos`, `phase` and `predicted` (the probability that the
     graph predicted of the frame); then `joint_0`, …, `cell_0`, … (with `hand`, as in `Recording.to_frame`,
-    `cell_palm_0`) and the other senses. What is not known is missing. `from_parquet` reads it back.
+    `cell_palm_0`) and the other senses. Unknown values are missing. `from_parquet` reads it back.
 
     Raises ModuleNotFoundError without pyarrow, and ValueError if the recordings are of different hands.
     """
@@ -122,23 +124,23 @@ def from_parquet(
 ) -> list[Recording]:
     """Writes the recordings of a file of `to_parquet`, or of a dataset of `to_lerobot`, to the folder `out`, and returns them.
 
-    Each has the name that it had, the same frames with their numbers and times, and the same labels and outcomes; a label
-    and an outcome get the times of the grasp's first and last frame. Scenes, decisions and predictions are not written: a
-    graph or `blindgrasp predict` makes the last two. Columns that `to_parquet` does not write are not read. `hand` is the layout of a hand that is not built in. A recording without grasps has no
-    rows, and so does not come back.
+    Each has its name, the same frames with their numbers and times, and the same labels and outcomes. A label gets the time
+    of the grasp's first frame, and an outcome that of the last one. Scenes, decisions and predictions are not written: a
+    graph or `blindgrasp predict` makes the last two. A recording without grasps has no rows, and so does not come back.
+    Columns that `to_parquet` does not write are not read. `hand` is the layout of a hand that is not built in.
 
     Raises ModuleNotFoundError without pyarrow, ValueError if the source is not written so, two recordings have one name or
     the frames of a grasp are not together, and ProgramError if the hand is another one or a file exists.
     """
     pa = _pyarrow()
     path, folder = Path(fspath(source)), Path(fspath(out))
-    folder.mkdir(parents=True, exist_ok=True)
     rows = _rows_of_dataset(pa, path) if path.is_dir() else _rows_of_file(pa, path, hand)
     recordings: list[Recording] = []
     for name, of_recording in itertools.groupby(rows, lambda row: row["recording"]):
-        to = folder / name
-        if name is None or Path(name).name != name or any(to == known.path for known in recordings):
+        if not isinstance(name, str) or Path(name).name != name or any(name == known.path.name for known in recordings):
             raise ValueError(f"{path}: expected the names of different files in the column recording, found {name!r}")
+        to = folder / name
+        folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory() as lines_in:
             lines = Path(lines_in) / name
             with lines.open("w", encoding="utf-8") as stream:
@@ -181,6 +183,8 @@ def _rows_of_dataset(pa: Any, root: Path) -> Iterator[dict[str, Any]]:
             _check(path, {"episode_index", "seq", "stamp_nanos", "phase"}, file.schema_arrow.names)
             for batch in file.iter_batches(1000):
                 for row in batch.to_pylist():
+                    if row["episode_index"] not in episodes:
+                        raise ValueError(f"{root}: expected episode {row['episode_index']} in meta/episodes, found none")
                     observed = {name: value for name, value in row.items() if name.startswith("observation.")}
                     values = {name: value if isinstance(value, list) else [value] for name, value in observed.items()}
                     senses = {sense_of.get(name, name.removeprefix("observation.")): value for name, value in values.items()}
@@ -218,8 +222,9 @@ def _write_lines(rows: Iterator[dict[str, Any]], stream: Any) -> str:
             # A grasp that lacks a sense has no number of it.
             frame |= {sense: values for sense, values in row["senses"].items() if not np.isnan(np.array(values, float)).all()}
             write("/tactile", row["seq"], row, frame | {"day": int(row["day"] or 0)})
-        if row["outcome_lifted"] is not None:
-            write("/outcome", n_outcomes, row, {name: row[f"outcome_{name}"] for name in OUTCOME})
+        if row["outcome_lifted"] in (True, False):
+            values = {name: AS_KIND[kind](row[f"outcome_{name}"]) for name, kind in OUTCOME.items()}
+            write("/outcome", n_outcomes, row, values)
             n_outcomes += 1
     return first["hand"]
 

@@ -247,7 +247,15 @@ class Recordings(Folder):
         self.assert_same(grasps, again)
         with self.assertRaisesRegex(blindgrasp.ProgramError, "--overwrite"):
             blindgrasp.from_parquet(path, self.folder / "again")
-        blindgrasp.from_parquet(path, self.folder / "again", overwrite=True)
+        # pandas makes floats of booleans beside missing ones.
+        frames = frames.assign(outcome_lifted=frames["outcome_lifted"].astype(float), stable=frames["stable"].astype(float))
+        frames.to_parquet(path)
+        [again] = blindgrasp.from_parquet(path, self.folder / "again", overwrite=True)
+        self.assert_same(grasps, again)
+        frames.assign(recording=None).to_parquet(path)
+        with self.assertRaisesRegex(ValueError, "names of different files in the column recording, found None"):
+            blindgrasp.from_parquet(path, self.folder / "nameless")
+        self.assertFalse((self.folder / "nameless").exists())
 
     def assert_same(self, grasps, again):
         """All but decisions and predictions."""
@@ -966,7 +974,7 @@ class Pages(Folder):
         self.assertIn("2 2100.5 Label(", printed.getvalue())
         features = pd.read_csv(self.folder / "features.csv")
         self.assertLessEqual({"stable", "object"}, set(features.columns))
-        # The table has become a recording again.
+        # The dataset has become a recording again.
         table, again = names["table"], blindgrasp.Recording(self.folder / "again-dataset/held-out.mcap").to_frame()
         self.assertEqual(again["stable"].tolist(), table["stable"].tolist())
         self.assertEqual(again["object_class"].tolist(), table["object_class"].tolist())

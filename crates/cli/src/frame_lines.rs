@@ -22,7 +22,7 @@ const MAX_BYTES: u64 = 1 << 30;
 /// The size limit of a line: thousands of cells.
 const MAX_LINE_BYTES: u64 = 4 << 20;
 
-/// The frames of lines, and what they say of the grasps.
+/// The frames, labels and outcomes of lines.
 pub struct FrameLines {
     pub frames: Vec<Stamped<TactileFrame>>,
     /// The labels by number of the grasp and epoch, with their headers if they have lines of their own.
@@ -30,8 +30,7 @@ pub struct FrameLines {
     pub outcomes: Vec<Stamped<LiftOutcome>>,
 }
 
-/// A line: a frame, with the outcome of its lift if it says it and names the object; what is known of a grasp; or a sample of
-/// another topic.
+/// A line: a frame, with the label that it reports if it names the object; a label; an outcome; or a sample of another topic.
 enum Line {
     Frame(Stamped<TactileFrame>, Option<GraspTruth>),
     Truth(Stamped<GraspTruth>),

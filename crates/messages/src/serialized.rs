@@ -28,7 +28,7 @@ pub mod hex_id {
     }
 }
 
-/// The value of a number that JSON does not have.
+/// The value of a number that a line leaves out.
 pub(crate) fn nan() -> f64 {
     f64::NAN
 }

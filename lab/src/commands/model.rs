@@ -71,9 +71,8 @@ struct AdaptArguments {
 
 /// Make the model of a hand that has none yet: a plain rule, which needs no training.
 ///
-/// Of a grasp that two of the fingers and the palm feel it asks for a test lift, and it lifts if they then feel enough together.
-/// Nothing is promised.
-/// After 20 lifts or more, blindgrasp model adapt corrects it by the robot's own outcomes; blindgrasp learn trains a better one.
+/// It asks for a test lift of a grasp that two fingers, or one and the palm, feel, and lifts if the hand then feels enough. It
+/// promises nothing. After 20 lifts or more, blindgrasp model adapt corrects it by the robot's own outcomes; blindgrasp learn trains a better one.
 #[derive(Debug, Args)]
 #[command(after_help = "Example: blindgrasp model rule --hand my-hand.yaml --out rule.json\n         \
                         blindgrasp run dataflow-live.yaml --set hand=my-hand.yaml --set model=rule.json \\\n             --set promised_drops=1")]

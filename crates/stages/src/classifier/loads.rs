@@ -18,8 +18,7 @@ pub struct LoadRule {
 }
 
 impl LoadRule {
-    /// The load beyond the least one, newtons. If too few fingers feel something, it is that of a hand that lacks one newton more
-    /// than the whole least load.
+    /// The load beyond the least one, newtons. If too few fingers feel something, it is one newton below that of an empty hand.
     pub fn decision_value(&self, values: &[f64]) -> f64 {
         let (mut n_fingers, mut newtons) = (0, 0.0);
         for pads in &self.fingers {

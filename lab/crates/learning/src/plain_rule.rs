@@ -20,15 +20,20 @@ const LEAST_FINGERS: usize = 2;
 /// The greatest limit of a quantity that can have any value.
 const NO_LIMIT: f64 = 1e6;
 
-/// Lifts a grasp if two fingers feel it and the hand feels `least_newtons` or more after a test lift, and makes the test lift if
-/// two fingers feel it; the palm counts as one. A newton more counts as a log-odds of one, until `model adapt` has learned from
+/// The model of a plain rule: it asks for a test lift of a grasp that two fingers feel, and lifts if two fingers feel it then and
+/// the hand feels `least_newtons` or more. The palm counts as a finger. A newton more counts as a log-odds of one, until `model adapt` has learned from
 /// the robot's lifts.
 ///
 /// # Errors
 /// The hand has pads on one finger alone.
 pub fn plain_rule(hand: &Hand, least_newtons: f64, made_by: String) -> Result<Model, TrainingError> {
-    let recipe =
-        Recipe { name: "loads".into(), blocks: vec![Block::Pads], learner: Learner::Loads, ..Recipe::default() };
+    let recipe = Recipe {
+        name: "loads".into(),
+        blocks: vec![Block::Pads],
+        n_words: 1,
+        learner: Learner::Loads,
+        ..Recipe::default()
+    };
     // No value is of the histogram.
     let features = FeatureExtractor::new(hand, &recipe.blocks, Dictionary { words_m: vec![[0.0; 3]] }, recipe.sigma_m);
     let training_range = all_that_is_possible(hand);
