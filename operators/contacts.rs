@@ -11,6 +11,7 @@ use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::stage::{self, Answers, Stage, decode_state, encode_state};
 use blindgrasp_stages::contacts::ContactSummary;
 use blindgrasp_stages::day::GraspPlace;
+use blindgrasp_stages::frozen_skin::FrozenSkin;
 use blindgrasp_stages::glitches::GlitchFilter;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::sensors::{Described, SensorCheck, SensorFault, SensorMemory};
@@ -95,8 +96,8 @@ struct GraspLog {
     n_more: u64,
 }
 
-/// The state that is saved: of the filter and of the watch, as far as there are any.
-type State = (Option<GlitchFilter>, Option<(SensorMemory, Option<GraspPlace>, BTreeMap<String, u64>)>);
+/// The state that is saved: of the filter and of the watch, as far as there are any, and what shows that the skin has stopped.
+type State = (Option<GlitchFilter>, FrozenSkin, Option<(SensorMemory, Option<GraspPlace>, BTreeMap<String, u64>)>);
 
 /// Finds faulty sensors.
 struct Watch {
@@ -191,7 +192,7 @@ impl Stage for FindContacts {
     type Out = ContactSet;
 
     fn has_state(&self) -> bool {
-        self.watch.is_some() || self.hand.median_filter
+        true
     }
 
     fn answer(&mut self, head: &TactileFrameHead, items: &[f64], now_nanos: u64, answers: &mut Answers<ContactSet>) {
@@ -230,23 +231,21 @@ impl Stage for FindContacts {
     }
 
     fn state(&self, bytes: &mut Vec<u8>) -> anyhow::Result<()> {
-        if !self.has_state() {
-            return Ok(());
-        }
         let filter = self.hand.median_filter.then_some(&self.memory.filter);
         let watch =
             self.watch.as_ref().map(|Watch { memory, reported, .. }| (memory, reported.grasp, &reported.counts));
-        encode_state("contacts", (filter, watch), bytes)
+        encode_state("contacts", (filter, &self.memory.frozen, watch), bytes)
     }
 
     fn restore(&mut self, state: Option<&[u8]>) -> anyhow::Result<bool> {
         let saved: State = match state {
-            Some(bytes) if self.has_state() => decode_state("contacts", bytes)?,
-            _ => Default::default(),
+            Some(bytes) => decode_state("contacts", bytes)?,
+            None => Default::default(),
         };
         self.memory.filter = saved.0.unwrap_or_default();
+        self.memory.frozen = saved.1;
         if let Some(watch) = &mut self.watch {
-            (watch.memory, watch.reported.grasp, watch.reported.counts) = saved.1.unwrap_or_default();
+            (watch.memory, watch.reported.grasp, watch.reported.counts) = saved.2.unwrap_or_default();
         }
         Ok(state.is_some())
     }

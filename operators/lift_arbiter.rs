@@ -104,6 +104,7 @@ pub(crate) fn work(operator: &Operator) -> anyhow::Result<()> {
         ended: EndedPromises::default(),
         reported: Default::default(),
         has_said_loosened: false,
+        reused: None,
         has_said_creep: false,
     };
     stage::run(operator, "prediction", "decision", 0, BTreeMap::new(), stage)
@@ -139,6 +140,8 @@ struct Arbiter {
     reported: (PromiseMonitor, u64, [u64; 2]),
     /// Whether it has said that its threshold is below the model's.
     has_said_loosened: bool,
+    /// The grasp of which it has said that its number was used again.
+    reused: Option<u64>,
     /// Whether it has said that contacts creep.
     has_said_creep: bool,
 }
@@ -167,6 +170,14 @@ impl Stage for Arbiter {
                 // The clock of a frame from the future cannot be trusted: the frame counts as infinitely old.
                 let age_nanos = now_nanos.checked_sub(head.header.origin_nanos).unwrap_or(u64::MAX);
                 self.arbiter.on_prediction(&head.header, &prediction, age_nanos, &mut self.decided);
+                if self.reused != Some(head.grasp_id) && self.arbiter.is_reused(head.grasp_id) {
+                    self.reused = Some(head.grasp_id);
+                    tracing::warn!(
+                        "grasp {} is decided, but its hand has opened and settled again: no decision follows; expected another \
+                         grasp_id for each grasp",
+                        head.grasp_id
+                    );
+                }
                 if !self.has_said_loosened && self.arbiter.options().loosens(&prediction) {
                     self.has_said_loosened = true;
                     tracing::warn!(

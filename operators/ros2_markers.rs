@@ -18,14 +18,14 @@ const LINK_COLOUR: [f32; 4] = [0.7, 0.72, 0.75, 0.6];
 const SILENT_COLOUR: [f32; 4] = [0.35, 0.35, 0.4, 1.0];
 const FULL_COLOUR: [f32; 4] = [0.9, 0.1, 0.1, 1.0];
 
-#[derive(Serialize, Clone)]
+#[derive(Serialize, Clone, Default)]
 struct Time {
     sec: i32,
     nanosec: u32,
 }
 
 /// The fields of `visualization_msgs/msg/Marker` in their order.
-#[derive(Serialize)]
+#[derive(Serialize, Default)]
 struct Marker {
     stamp: Time,
     frame_id: &'static str,
@@ -52,7 +52,7 @@ struct Marker {
 }
 
 /// `sensor_msgs/msg/CompressedImage`.
-#[derive(Serialize)]
+#[derive(Serialize, Default)]
 struct Texture {
     stamp: Time,
     frame_id: &'static str,
@@ -79,23 +79,11 @@ pub fn hand_markers(hand: &Hand, sample: &Stamped<TactileFrame>, data: &mut Vec<
         ns,
         id: id as i32,
         kind,
-        action: 0,
         position: pose.translation.vector.into(),
         orientation_xyzw: pose.rotation.coords.into(),
         scale,
         color: LINK_COLOUR,
-        lifetime: Time { sec: 0, nanosec: 0 },
-        frame_locked: false,
-        points: Vec::new(),
-        colors: Vec::new(),
-        texture_resource: "",
-        texture: Texture { stamp: Time { sec: 0, nanosec: 0 }, frame_id: "", format: "", data: Vec::new() },
-        uv_coordinates: Vec::new(),
-        text: "",
-        mesh_resource: "",
-        mesh_filename: "",
-        mesh_data: Vec::new(),
-        mesh_use_embedded_materials: false,
+        ..Marker::default()
     };
     let shapes = hand.links.iter().zip(&palm_from_links);
     let shapes = shapes.flat_map(|(link, pose)| link.shapes.iter().map(move |shape| (shape, pose)));

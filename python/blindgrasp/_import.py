@@ -99,7 +99,7 @@ def _write(table: Any, path: Path) -> None:
         first = next(dicts, {})
         if not isinstance(first, Mapping):
             found = type(first).__name__
-            raise TypeError(f"expected a DataFrame, a dict of columns, or rows that are dicts; found rows that are {found}")
+            raise TypeError(f"expected a DataFrame, a dict of columns, or rows that are dicts; found rows that are {found} (polars: iter_rows(named=True))")
         names = list(first)
         rows = ([row.get(name) for name in names] for row in itertools.chain([first] if names else [], dicts))
     with path.open("w", encoding="utf-8", newline="") as stream:

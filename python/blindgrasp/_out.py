@@ -12,6 +12,7 @@ import os
 import re
 import shutil
 import tempfile
+import warnings
 from collections.abc import Iterator, Sequence
 from os import PathLike, fspath
 from pathlib import Path
@@ -21,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ._model import SENSES
-from ._program import answer_of
-from ._recording import Grasp, Recording
+from ._program import ProgramError, answer_of
+from ._recording import PHASES, Grasp, Recording
 from ._tables import cell_names
 from ._types import Label
 
@@ -34,15 +35,17 @@ OUTCOME = {
     "turn_rad": "float64", "epsilon": "float64", "volume": "float64", "mass_kg": "float64", "friction": "float64",
     "thing": "string", "group": "string", "probed": "bool", "disturbed": "bool",
 }  # fmt: skip
-# pandas makes floats of numbers and booleans beside missing ones.
-AS_KIND: dict[str, Any] = {"bool": bool, "uint64": lambda value: int(value or 0), "float64": lambda value: value, "string": lambda value: value or ""}
+# Of a field of an outcome that is not known.
+MISSING_OF: dict[str, Any] = {"bool": False, "uint64": 0, "float64": None, "string": ""}
 # What is equal for all frames of a grasp.
 OF_GRASP = {
     "recording": "string", "hand": "string", "hand_id": "string", "model": "string", "day": "int64", "epoch": "uint64",
-    "grasp_id": "uint64", "stable": "bool", "object": "string", "object_class": "string", "epsilon": "float64",
+    "grasp_id": "uint64", "stable": "bool", "label": "string", "object": "string", "object_class": "string", "epsilon": "float64",
     "volume": "float64", "action": "string", "reason": "string", "probability_stable": "float64",
     **{f"outcome_{name}": kind for name, kind in OUTCOME.items()},
 }  # fmt: skip
+# Those without which a grasp cannot be read back.
+NEEDED = ("hand_id", "epoch", "grasp_id", "stable")
 # Frames that are written together: a reader needs some kilobytes for each column of such a group.
 ROWS_TOGETHER = 10_000
 # LeRobot's number of files in a folder.
@@ -73,10 +76,10 @@ def to_parquet(
 
     def tables() -> Iterator[Any]:
         n_grasps = 0
-        for recording in data.recordings:
+        for recording_name, recording in data.recordings.items():
             for grasp in recording:
                 columns: dict[str, Any] = {
-                    name: [value] * len(grasp.seq) for name, value in _of_grasp(recording, grasp).items()
+                    name: [value] * len(grasp.seq) for name, value in _of_grasp(recording_name, recording, grasp).items()
                 }
                 columns |= {"seq": grasp.seq, "stamp_nanos": grasp.stamp_nanos, "phase": grasp.phase.tolist()}
                 columns["predicted"] = grasp.probability_stable
@@ -127,37 +130,56 @@ def from_parquet(
     Each has its name, the same frames with their numbers and times, and the same labels and outcomes. A label gets the time
     of the grasp's first frame, and an outcome that of the last one. Scenes, decisions and predictions are not written: a
     graph or `blindgrasp predict` makes the last two. A recording without grasps has no rows, and so does not come back.
-    Columns that `to_parquet` does not write are not read. `hand` is the layout of a hand that is not built in.
+    Columns that `to_parquet` does not write are not read. `hand` is the layout of a hand that is not built in. It warns of
+    frames that are not in order. After an error there is no new recording.
 
-    Raises ModuleNotFoundError without pyarrow, ValueError if the source is not written so, two recordings have one name or
-    the frames of a grasp are not together, and ProgramError if the hand is another one or a file exists.
+    Raises ModuleNotFoundError without pyarrow, FileExistsError, ValueError if the source is not written so, is not whole, or
+    has values that cannot be, and ProgramError if the hand is another one.
     """
     pa = _pyarrow()
     path, folder = Path(fspath(source)), Path(fspath(out))
     rows = _rows_of_dataset(pa, path) if path.is_dir() else _rows_of_file(pa, path, hand)
-    recordings: list[Recording] = []
-    for name, of_recording in itertools.groupby(rows, lambda row: row["recording"]):
-        if not isinstance(name, str) or Path(name).name != name or any(name == known.path.name for known in recordings):
-            raise ValueError(f"{path}: expected the names of different files in the column recording, found {name!r}")
-        to = folder / name
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory() as lines_in:
-            lines = Path(lines_in) / name
+    is_new = not folder.exists()
+    try:
+        names = _write_recordings(path, rows, folder, hand, overwrite)
+    except BaseException:
+        if is_new:
+            shutil.rmtree(folder, ignore_errors=True)
+        raise
+    return [Recording(folder / name) for name in names]
+
+
+def _write_recordings(
+    path: Path, rows: Iterator[dict[str, Any]], folder: Path, hand: str | PathLike[str] | None, overwrite: bool
+) -> list[str]:
+    """Writes the recordings of the rows to the folder, all or none, and returns their names."""
+    folder.mkdir(parents=True, exist_ok=True)
+    names: list[str] = []
+    with tempfile.TemporaryDirectory(prefix=".blindgrasp-", dir=folder) as unfinished:
+        for name, of_recording in itertools.groupby(rows, lambda row: row["recording"]):
+            if not isinstance(name, str) or not name or Path(name).is_absolute() or ".." in Path(name).parts or name in names:
+                raise ValueError(f"{path}: expected the names of different files in the column recording, found {name!r}")
+            if (folder / name).exists() and not overwrite:
+                raise FileExistsError(f"{folder / name}: the file exists: name another folder, or say overwrite=True")
+            lines, to = Path(unfinished) / "lines.jsonl", Path(unfinished) / name
+            to.parent.mkdir(parents=True, exist_ok=True)
             with lines.open("w", encoding="utf-8") as stream:
-                layout = _write_lines(of_recording, stream)
-            words = [f"--hand={layout if hand is None else fspath(hand)}", f"--out={to}", *(["--overwrite"] if overwrite else [])]
-            answer_of(["import", str(lines), "--lines", "--json", *words])
-        recordings.append(Recording(to))
-    if not recordings:
-        raise ValueError(f"{path}: expected frames, found none")
-    return recordings
+                layout = _write_lines(path, of_recording, stream)
+            answer_of(["import", str(lines), "--lines", "--json", f"--hand={layout if hand is None else fspath(hand)}", f"--out={to}"])
+            names.append(name)
+        if not names:
+            raise ValueError(f"{path}: expected frames, found none")
+        for name in names:
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            os.replace(Path(unfinished) / name, folder / name)
+    return names
 
 
 def _rows_of_file(pa: Any, path: Path, hand: str | PathLike[str] | None) -> Iterator[dict[str, Any]]:
     """Frames as dicts: the values of the grasp, `seq`, `stamp_nanos`, `phase`, and the values of each sense as a list."""
     with pa.parquet.ParquetFile(path) as file:
         found = file.schema_arrow.names
-        _check(path, {*OF_GRASP, "grasp", "seq", "stamp_nanos", "phase", "predicted"}, found)
+        _check(path, {*NEEDED, "recording", "hand", "grasp", "seq", "stamp_nanos", "phase"}, found)
         columns: dict[str, list[str]] = {}
         for sense in ("joint", "cell", *SENSES):
             numbered = [name for name in found if re.fullmatch(rf"{sense}_\d+", name)]
@@ -165,7 +187,11 @@ def _rows_of_file(pa: Any, path: Path, hand: str | PathLike[str] | None) -> Iter
         for batch in file.iter_batches(1000):
             for row in batch.to_pylist():
                 if not columns["cell"]:
-                    columns["cell"] = [f"cell_{name}" for name in cell_names(row["hand"] if hand is None else fspath(hand))]
+                    try:
+                        names = cell_names(row["hand"] if hand is None else fspath(hand))
+                    except (ProgramError, TypeError) as error:
+                        raise ValueError(f"{path}: its cells have names: give the layout of its hand {row['hand']!r} (hand=)") from error
+                    columns["cell"] = [f"cell_{name}" for name in names]
                     _check(path, set(columns["cell"]), found)
                 yield row | {"senses": {sense: [row[name] for name in names] for sense, names in columns.items()}}
 
@@ -175,10 +201,18 @@ def _rows_of_dataset(pa: Any, root: Path) -> Iterator[dict[str, Any]]:
     episodes: dict[int, dict[str, Any]] = {}
     for path in sorted(root.glob("meta/episodes/*/*.parquet")):
         table = pa.parquet.read_table(path)
-        _check(path, {*OF_GRASP, "episode_index"}, table.column_names)
+        _check(path, {*NEEDED, "recording", "hand", "episode_index", "length"}, table.column_names)
         episodes |= {row["episode_index"]: row for row in table.to_pylist()}
+    files = sorted(root.glob("data/*/*.parquet"))
+    n_frames, n_expected = (sum(pa.parquet.read_metadata(path).num_rows for path in files), sum(row["length"] for row in episodes.values()))
+    n_episodes = json.loads((root / "meta/info.json").read_text(encoding="utf-8"))["total_episodes"]
+    if (n_frames, len(episodes)) != (n_expected, n_episodes):
+        raise ValueError(
+            f"{root}: expected {n_episodes} episodes with {n_expected} frames, found {len(episodes)} with {n_frames}: is a file of "
+            "data or meta/episodes missing or cut?"
+        )
     sense_of = {"observation.state": "joint", "observation.tactile": "cell"}
-    for path in sorted(root.glob("data/*/*.parquet")):
+    for path in files:
         with pa.parquet.ParquetFile(path) as file:
             _check(path, {"episode_index", "seq", "stamp_nanos", "phase"}, file.schema_arrow.names)
             for batch in file.iter_batches(1000):
@@ -193,40 +227,83 @@ def _rows_of_dataset(pa: Any, root: Path) -> Iterator[dict[str, Any]]:
 
 def _check(path: Path, expected: set[str], found: Sequence[str]) -> None:
     if missing := sorted(expected - set(found)):
-        raise ValueError(f"{path}: expected a file that to_parquet or to_lerobot of this version wrote; it has no {missing[0]!r}")
+        raise ValueError(f"{path}: expected the columns of to_parquet or to_lerobot; it has no {missing[0]!r}")
 
 
-def _write_lines(rows: Iterator[dict[str, Any]], stream: Any) -> str:
+def _write_lines(path: Path, rows: Iterator[dict[str, Any]], stream: Any) -> str:
     """Writes frames, labels and outcomes as `blindgrasp export` does, and returns the name of the hand."""
     n_labels = n_outcomes = 0
     seen: set[tuple[int, int]] = set()
 
-    def write(topic: str, seq: int, row: dict[str, Any], data: dict[str, Any]) -> None:
+    def write(topic: str, seq: int, row: dict[str, Any], data: dict[str, Any], **more: str) -> None:
         header = {"topic": topic, "seq": seq, "hand_id": row["hand_id"], "epoch": row["epoch"], "stamp_nanos": row["stamp_nanos"]}
-        print(json.dumps(header | {"data": {"grasp_id": row["grasp_id"]} | data}), file=stream)
+        print(json.dumps(header | more | {"data": {"grasp_id": row["grasp_id"]} | data}), file=stream)
 
-    for _, of_grasp in itertools.groupby(rows, lambda row: row["grasp"]):
-        first = row = next(of_grasp)
+    for number, of_grasp in itertools.groupby(rows, lambda row: row["grasp"]):
+        place = f"{path}, grasp {number}"
+        first = row = _checked(place, next(of_grasp))
         key = (first["epoch"], first["grasp_id"])
         if key in seen:
-            where = f"{first['recording']}, grasp {first['grasp_id']}"
+            where = f"{path}: {first['recording']}, grasp {first['grasp_id']}"
             raise ValueError(f"{where}: expected its frames together, and recordings with different names")
         seen.add(key)
-        if first["stable"] in (True, False):
-            label = {"stable": bool(first["stable"]), "epsilon": first["epsilon"], "volume": first["volume"]}
+        if first["stable"] is not None:
+            label = {"stable": first["stable"], "epsilon": first.get("epsilon"), "volume": first.get("volume")}
             label |= {name: first[name] or "" for name in ("object", "object_class")}
-            write("/truth", n_labels, first, label)
+            write("/truth", n_labels, first, label, **({"label": first["label"]} if first.get("label") else {}))
             n_labels += 1
-        for row in itertools.chain([first], of_grasp):
+        for next_row in itertools.chain([first], (_checked(place, row) for row in of_grasp)):
+            for name in (*NEEDED, "day", "outcome_lifted", "outcome_held"):
+                if next_row.get(name) != first.get(name):
+                    raise ValueError(f"{place}: {name} changes from {first.get(name)!r} to {next_row.get(name)!r} within the grasp")
+            if next_row["seq"] < row["seq"]:
+                warnings.warn(f"{place}: frame {next_row['seq']} comes after frame {row['seq']}", stacklevel=3)
+            row = next_row
             frame = {"joints": row["senses"].pop("joint"), "cells_newtons": row["senses"].pop("cell"), "phase": row["phase"]}
             # A grasp that lacks a sense has no number of it.
             frame |= {sense: values for sense, values in row["senses"].items() if not np.isnan(np.array(values, float)).all()}
-            write("/tactile", row["seq"], row, frame | {"day": int(row["day"] or 0)})
-        if row["outcome_lifted"] in (True, False):
-            values = {name: AS_KIND[kind](row[f"outcome_{name}"]) for name, kind in OUTCOME.items()}
-            write("/outcome", n_outcomes, row, values)
+            write("/tactile", row["seq"], row, frame | {"day": row["day"]})
+        if first.get("outcome_lifted") is not None:
+            write("/outcome", n_outcomes, row, {name: first[f"outcome_{name}"] for name in OUTCOME})
             n_outcomes += 1
     return first["hand"]
+
+
+def _checked(place: str, row: dict[str, Any]) -> dict[str, Any]:
+    """The row with values of the right kinds. pandas makes floats of whole numbers and booleans beside missing ones.
+
+    Raises ValueError that names the column.
+    """
+
+    def value(name: str, kind: str, missing: Any) -> Any:
+        found = row.get(name)
+        if found is None or found != found:
+            return missing
+        if kind == "string" and isinstance(found, str):
+            return found
+        if kind == "float64" and isinstance(found, (int, float)):
+            return found
+        if kind == "bool" and found in (True, False):
+            return bool(found)
+        if kind in ("uint64", "int64") and isinstance(found, (int, float)) and found == int(found):
+            return int(found)
+        expected = {"bool": "true, false or nothing", "string": "text", "float64": "a number"}.get(kind, "a whole number")
+        raise ValueError(f"{place}: the column {name} has {found!r}, expected {expected}")
+
+    known = {name: value(name, "uint64", None) for name in ("seq", "stamp_nanos", "epoch", "grasp_id")}
+    known |= {name: value(name, "string", None) for name in ("hand", "hand_id", "phase")}
+    for name, found in known.items():
+        if found is None:
+            raise ValueError(f"{place}: the column {name} lacks a value")
+    if known["phase"] not in PHASES:
+        raise ValueError(f"{place}: the column phase has {known['phase']!r}, expected one of {', '.join(PHASES)}")
+    known |= {name: value(name, "string", None) for name in ("object", "object_class", "label")}
+    known |= {name: value(name, "float64", None) for name in ("epsilon", "volume")}
+    known |= {"stable": value("stable", "bool", None), "day": value("day", "uint64", 0)}
+    lifted = value("outcome_lifted", "bool", None)
+    if lifted is not None:
+        known |= {f"outcome_{name}": value(f"outcome_{name}", kind, MISSING_OF[kind]) for name, kind in OUTCOME.items()}
+    return row | known | {"outcome_lifted": lifted}
 
 
 def _pyarrow() -> Any:
@@ -257,11 +334,11 @@ def _senses(grasp: Grasp) -> dict[str, NDArray[np.float64]]:
     return {"joint": grasp.joints, "cell": grasp.cells_newtons} | grasp.senses
 
 
-def _of_grasp(recording: Recording, grasp: Grasp) -> dict[str, Any]:
-    """The values of OF_GRASP."""
+def _of_grasp(name: str, recording: Recording, grasp: Grasp) -> dict[str, Any]:
+    """The values of OF_GRASP. `name` is the recording's in the data set."""
     label, decision, outcome = grasp.label or Label(False), grasp.decision, grasp.outcome or {}
     return {
-        "recording": recording.path.name,
+        "recording": name,
         "hand": recording.hand,
         "hand_id": grasp.hand_id,
         "model": recording.metadata.get("graph", {}).get("models"),
@@ -269,6 +346,7 @@ def _of_grasp(recording: Recording, grasp: Grasp) -> dict[str, Any]:
         "epoch": grasp.epoch,
         "grasp_id": grasp.grasp_id,
         "stable": grasp.label and label.is_stable,
+        "label": grasp.label and recording.label_kind,
         "object": label.object_id or None,
         "object_class": label.object_class or None,
         "epsilon": label.epsilon,
@@ -285,19 +363,29 @@ class _DataSet:
 
     def __init__(self, recordings: Source | Sequence[Source], hand: str | PathLike[str] | None) -> None:
         given = [recordings] if isinstance(recordings, (str, PathLike, Recording)) else recordings
-        self.recordings: list[Recording] = []
+        found: list[Recording] = []
         for source in given:
             if isinstance(source, Recording):
-                self.recordings.append(source)
+                found.append(source)
                 continue
             path = Path(fspath(source))
-            self.recordings += map(Recording, sorted(path.glob("*.mcap")) if path.is_dir() else [path])
-        hands = sorted({f"{recording.hand} ({recording.hand_id})" for recording in self.recordings})
+            found += map(Recording, sorted(path.glob("*.mcap")) if path.is_dir() else [path])
+        # Files of one name, as parts of several folders, have the names of their folders before it.
+        paths = [recording.path.absolute() for recording in found]
+        names = [path.name for path in paths]
+        if len(set(names)) < len(names) and len(set(paths)) == len(paths):
+            above = os.path.commonpath([path.parent for path in paths])
+            names = [path.relative_to(above).as_posix() for path in paths]
+        self.recordings = dict(zip(names, found))
+        """By their names."""
+        if len(self.recordings) < len(found):
+            raise ValueError(f"expected different recordings, found {max(names, key=names.count)} twice")
+        hands = sorted({f"{recording.hand} ({recording.hand_id})" for recording in found})
         if len(hands) != 1:
             raise ValueError(f"expected recordings of one hand, found {', '.join(hands) or 'none'}")
         self.widths: dict[str, int] = {}
         self.frames_per_second = 0
-        for recording in self.recordings:
+        for recording in found:
             for grasp in recording:
                 for sense, rows in _senses(grasp).items():
                     self.widths[sense] = max(self.widths.get(sense, 0), rows.shape[1])
@@ -343,9 +431,9 @@ class _LeRobot:
         self.stats: dict[str, dict[str, Any]] = {}
 
     def write(self, root: Path) -> None:
-        for idx, recording in enumerate(self.data.recordings):
+        for idx, (name, recording) in enumerate(self.data.recordings.items()):
             place = {"chunk_index": idx // FILES_IN_CHUNK, "file_index": idx % FILES_IN_CHUNK}
-            _write(root / DATA_PATH.format(**place), self.schema, self._tables(recording, place))
+            _write(root / DATA_PATH.format(**place), self.schema, self._tables(name, recording, place))
         pa = self.pa
         names = ["episode_index", "length", "dataset_from_index", "dataset_to_index"]
         names += [f"{folder}/{kind}_index" for folder in ("data", "meta/episodes") for kind in ("chunk", "file")]
@@ -361,7 +449,7 @@ class _LeRobot:
         _write(root / "meta/tasks.parquet", tasks.schema, iter([tasks]))
         info = {
             "codebase_version": "v3.0",
-            "robot_type": self.data.recordings[0].hand,
+            "robot_type": next(iter(self.data.recordings.values())).hand,
             "total_episodes": len(self.episodes),
             "total_frames": self.n_frames,
             "total_tasks": len(self.tasks),
@@ -378,14 +466,14 @@ class _LeRobot:
         for name, content in (("info", info), ("stats", stats)):
             (root / f"meta/{name}.json").write_text(json.dumps(content, indent=4), encoding="utf-8")
 
-    def _tables(self, recording: Recording, place: dict[str, int]) -> Iterator[Any]:
+    def _tables(self, name: str, recording: Recording, place: dict[str, int]) -> Iterator[Any]:
         for grasp in recording:
-            n, known = len(grasp.seq), _of_grasp(recording, grasp)
+            n, known = len(grasp.seq), _of_grasp(name, recording, grasp)
             task = known["object"] or known["outcome_thing"] or "unknown"
             task_idx = self.tasks.setdefault(task, len(self.tasks))
             episode = {"episode_index": len(self.episodes), "length": n, "tasks": [task]}
             episode |= {"dataset_from_index": self.n_frames, "dataset_to_index": self.n_frames + n}
-            episode |= {f"data/{name}": idx for name, idx in place.items()}
+            episode |= {f"data/{key}": idx for key, idx in place.items()}
             self.episodes.append(episode | {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0} | known)
             frames = np.arange(n)
             columns: dict[str, Any] = {
@@ -400,11 +488,11 @@ class _LeRobot:
                 "index": frames + self.n_frames,
                 "task_index": np.full(n, task_idx),
             }
-            for sense, name in self.feature_of.items():
+            for sense, feature in self.feature_of.items():
                 rows = self.data.rows(grasp, sense)
-                self._add(name, rows)
+                self._add(feature, rows)
                 values = self.pa.array(rows.ravel())
-                columns[name] = values if rows.shape[1] == 1 else self.pa.FixedSizeListArray.from_arrays(values, rows.shape[1])
+                columns[feature] = values if rows.shape[1] == 1 else self.pa.FixedSizeListArray.from_arrays(values, rows.shape[1])
             self.n_frames += n
             yield self.pa.table(columns, self.schema)
 

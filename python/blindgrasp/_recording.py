@@ -8,6 +8,7 @@ decisions of all. What is not done here: repair (`blindgrasp info --repair`), co
 from __future__ import annotations
 
 import dataclasses
+import json
 import struct
 import zlib
 from collections import defaultdict
@@ -171,6 +172,14 @@ class Recording:
         """The identity of the hand's layout, 16 hexadecimal digits."""
         self._n_grasps: int | None = None
 
+    @property
+    def label_kind(self) -> str | None:
+        """What stable means in its labels: `wrench-space` (the paper's), `lift`, or None if the recording does not say."""
+        if kind := self.metadata.get("truth", {}).get("label"):
+            return kind
+        report = self.metadata.get("simulation", {}).get("report")
+        return report and json.loads(report).get("label", "wrench-space")
+
     def __repr__(self) -> str:
         return f"Recording({str(self.path)!r}, hand={self.hand!r}, n_frames={self.topics[self.topic]})"
 
@@ -311,7 +320,7 @@ class Recording:
                     known.predictions[message.header.epoch, message.header.seq] = message.probability_stable
             elif topic == "/outcome":
                 known.outcomes[key] = {name: value for name, value in vars(message).items() if name != "header"}
-            elif key in labels:
+            elif key in labels and not (labels[key].is_stable and not message.stable):
                 raise RecordingError(f"{self.path}: grasp {key[1]} has two labels (/truth)")
             else:
                 fields = vars(message)
@@ -325,6 +334,8 @@ class Recording:
         numbers = [(key[0], frame.header.seq) for frame in frames]
         lists = [name for name, value in vars(frames[0]).items() if isinstance(value, np.ndarray)]
         tables = {name: _table([getattr(frame, name) for frame in frames]) for name in lists}
+        if missing := {"joints", "cells_newtons"} - tables.keys():
+            raise RecordingError(f"{self.path}: its frames have no {min(missing)}: another version of blindgrasp wrote it")
         joints, cells_newtons = tables.pop("joints"), tables.pop("cells_newtons")
         return Grasp(
             grasp_id=key[1],

@@ -86,8 +86,12 @@ def skin(
 
     Raises:
         ProgramError: the program refuses the hand.
-        ValueError: the model lacks a link of the cells, or its frame lies elsewhere, or an option cannot be.
+        ValueError: bodies of the model may sleep (`mjENBL_SLEEP`), so that they have no contacts; the model lacks a link of the cells, or its frame lies elsewhere, or an option cannot be.
     """
+    import mujoco
+
+    if model.opt.enableflags & getattr(mujoco.mjtEnableBit, "mjENBL_SLEEP", 0):
+        raise ValueError("bodies of the model may sleep, and have no contacts then: expected it without mjENBL_SLEEP")
     return Skin(_Places(model, cells_of(fspath(hand)), links or {}, prefix), SkinOptions(**options), seed)
 
 
@@ -105,6 +109,10 @@ class Skin:
         self._felt = self._slow = np.zeros(n_cells)
         self.names = places.names
         """The pad and number of each cell, like `palm_0`, in the hand's order."""
+
+    def reset(self) -> None:
+        """Begins at rest: call it after `mj_resetData`. A time before that of the last reading does the same."""
+        self._secs = np.inf
 
     def read(self, data: mujoco.MjData) -> NDArray[np.float64]:
         """The readings of the cells after `mj_step` or `mj_forward`, in the hand's order, newtons."""
@@ -211,14 +219,14 @@ class _Places:
         # The last one is for -1, the geom of a contact with a flexible body.
         self.part_of_geom = np.append(part_of_number[numbers[model.geom_bodyid]], -1)
         self.signs = np.array([[1.0], [-1.0]])
-        self._is_elliptic = model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+        self._model, self._elliptic = model, int(mujoco.mjtCone.mjCONE_ELLIPTIC)
 
     def newtons(self, contact: Any, efc_force: NDArray[np.float64]) -> NDArray[np.float64]:
         """The force of each contact at right angles to its surfaces; 0 of one that the solver leaves out."""
         first = contact.efc_address
         used = first >= 0
         newtons = np.zeros(len(first))
-        if self._is_elliptic:
+        if self._model.opt.cone == self._elliptic:
             newtons[used] = efc_force[first[used]]
         elif used.any():
             # It is the sum over the edges of a pyramid. The rows of contacts follow each other, up to the last row.

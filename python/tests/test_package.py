@@ -245,7 +245,7 @@ class Recordings(Folder):
         self.assertTrue(frames[frames["grasp_id"] < 11]["outcome_lifted"].isna().all())
         [again] = blindgrasp.from_parquet(path, self.folder / "again")
         self.assert_same(grasps, again)
-        with self.assertRaisesRegex(blindgrasp.ProgramError, "--overwrite"):
+        with self.assertRaisesRegex(FileExistsError, "overwrite=True"):
             blindgrasp.from_parquet(path, self.folder / "again")
         # pandas makes floats of booleans beside missing ones.
         frames = frames.assign(outcome_lifted=frames["outcome_lifted"].astype(float), stable=frames["stable"].astype(float))
@@ -256,6 +256,39 @@ class Recordings(Folder):
         with self.assertRaisesRegex(ValueError, "names of different files in the column recording, found None"):
             blindgrasp.from_parquet(path, self.folder / "nameless")
         self.assertFalse((self.folder / "nameless").exists())
+        for edited, says in (
+            ({"stable": frames["stable"].map({1.0: "yes", 0.0: "no"})}, r"grasp \d+: the column stable has '\w+', expected true, false or"),
+            ({"outcome_held": frames["outcome_held"].map(str)}, "the column outcome_held has 'False', expected true"),
+            ({"grasp": 0}, "grasp_id changes from 0 to 1 within the grasp"),
+            ({"seq": frames["seq"] + 0.5}, "the column seq has 0.5, expected a whole number"),
+            ({"phase": "setled"}, "the column phase has 'setled', expected one of open"),
+        ):
+            with self.subTest(says=says):
+                frames.assign(**edited).to_parquet(path)
+                with self.assertRaisesRegex(ValueError, says):
+                    blindgrasp.from_parquet(path, self.folder / "refused")
+                self.assertFalse((self.folder / "refused").exists())
+        frames.sort_values(["grasp", "seq"], ascending=[True, False]).to_parquet(path)
+        with self.assertWarnsRegex(UserWarning, "frame 12 comes after frame 13"):
+            blindgrasp.from_parquet(path, self.folder / "reversed")
+        # Only what is read back must be there.
+        needless = ["action", "reason", "probability_stable", "predicted", "model", "day", "object_class", *frames.filter(like="outcome_")]
+        frames.drop(columns=needless).to_parquet(path)
+        [again] = blindgrasp.from_parquet(path, self.folder / "less")
+        self.assertEqual([grasp.label.is_stable for grasp in again], [grasp.label.is_stable for grasp in grasps])
+
+    def test_what_stable_means_comes_back(self):
+        blindgrasp.to_parquet(HELD_OUT, self.folder / "frames.parquet")
+        blindgrasp.to_lerobot(HELD_OUT, self.folder / "dataset")
+        for source in ("frames.parquet", "dataset"):
+            [again] = blindgrasp.from_parquet(self.folder / source, self.folder / f"again-{source}")
+            self.assertEqual((blindgrasp.Recording(HELD_OUT).label_kind, again.label_kind), ("wrench-space", "wrench-space"))
+        # Half a dataset, as after a download that was interrupted.
+        [data] = (self.folder / "dataset").glob("data/*/*.parquet")
+        table = pd.read_parquet(data)
+        table[table["episode_index"] < 3].to_parquet(data)
+        with self.assertRaisesRegex(ValueError, "expected 240 episodes with 3360 frames, found 240 with 42"):
+            blindgrasp.from_parquet(self.folder / "dataset", self.folder / "half")
 
     def assert_same(self, grasps, again):
         """All but decisions and predictions."""
@@ -296,8 +329,12 @@ class Recordings(Folder):
         copied.parent.mkdir()
         copied.write_bytes(recording.read_bytes())
         blindgrasp.to_parquet([recording, copied], path)
-        with self.assertRaisesRegex(ValueError, "own.mcap, grasp [01]: expected its frames together, and .* different names"):
-            blindgrasp.from_parquet(path, self.folder / "twice")
+        both = blindgrasp.from_parquet(path, self.folder / "both")
+        self.assertEqual([again.path.relative_to(self.folder / "both").as_posix() for again in both], ["own.mcap", "copied/own.mcap"])
+        for again in both:
+            self.assert_same(grasps, again)
+        with self.assertRaisesRegex(ValueError, "expected different recordings, found own.mcap twice"):
+            blindgrasp.to_parquet([recording, recording], path)
         # pandas adds an index, and a user columns.
         blindgrasp.to_parquet(recording, path, hand="barrett-bh8-280")
         table = pd.read_parquet(path)
@@ -312,8 +349,10 @@ class Recordings(Folder):
 
     def test_grasps_of_two_recordings_come_back_unmerged(self):
         recording, _ = self.with_an_outcome()
+        copied = self.folder / "other.mcap"
+        copied.write_bytes(recording.read_bytes())
         path, again = self.folder / "frames.parquet", self.folder / "again.mcap"
-        blindgrasp.to_parquet([recording, recording], path)
+        blindgrasp.to_parquet([recording, copied], path)
         columns = {"grasp_column": "grasp", "phase_column": "phase"}
         frames = pd.read_parquet(path)
         # The grasps of both recordings have the same numbers, and may follow each other.

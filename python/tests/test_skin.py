@@ -181,6 +181,26 @@ class Skin(unittest.TestCase):
             with self.assertRaisesRegex(ValueError, f"{name} is .*, expected"):
                 blindgrasp.skin(model, GRIPPER, **wrong)
 
+    def test_a_reset_begins_at_rest_the_cone_may_change_and_bodies_may_not_sleep(self):
+        import mujoco
+
+        model, data = squeezed()
+        skin = blindgrasp.skin(model, GRIPPER, lag_secs=0.02)
+        skin.read(data)
+        data.time += 1.0
+        self.assertGreater(skin.read(data).max(), 0.1)
+        skin.reset()
+        np.testing.assert_array_equal(skin.read(data), 0.0)
+        forces = {}
+        for cone in (mujoco.mjtCone.mjCONE_PYRAMIDAL, mujoco.mjtCone.mjCONE_ELLIPTIC):
+            model.opt.cone = cone
+            mujoco.mj_forward(model, data)
+            forces[cone] = skin.forces(data)
+            np.testing.assert_array_equal(forces[cone], blindgrasp.skin(model, GRIPPER).forces(data))
+        model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_SLEEP
+        with self.assertRaisesRegex(ValueError, "may sleep, .* expected it without mjENBL_SLEEP"):
+            blindgrasp.skin(model, GRIPPER)
+
     def test_the_example_closes_a_gripper_on_a_ball(self):
         command = [sys.executable, REPOSITORY / "examples/mujoco_skin.py"]
         environment = os.environ | {"PYTHONPATH": str(Path(blindgrasp.__file__).parents[1])}

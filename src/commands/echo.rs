@@ -10,7 +10,7 @@ use anyhow::Context;
 use clap::Args;
 
 use super::elsewhere::MachineArgument;
-use super::export::json_line;
+use super::export::json_of;
 use super::ros_messages::RosMessages;
 use super::view::live::hand_of;
 use super::{Outcome, completions, secs_in, stop_signal};
@@ -81,7 +81,7 @@ impl Sink for Echo {
 impl Echo {
     fn print(&mut self, topic: &str, mut record: Record) -> anyhow::Result<()> {
         let Some(messages) = &mut self.messages else {
-            self.printer.print(&json_line(topic, &record)?);
+            self.printer.print(&json_of(topic, &record)?.to_string());
             return Ok(());
         };
         if let Record::Decision(sample) = &record {

@@ -7,11 +7,11 @@ use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use clap::Args;
-use serde_json::json;
+use serde_json::{Value, json};
 
 use super::{Outcome, check_new, completions, data_on_stdout, print_line};
 use blindgrasp_cli::shard::Shard;
-use blindgrasp_grasps::dataset::hand_of;
+use blindgrasp_grasps::dataset::{hand_of, label_of};
 use blindgrasp_grasps::feature_table::{FeatureTableError, write_feature_table};
 use blindgrasp_messages::files::{keep_mode, partial_path, private_file};
 use blindgrasp_operator::text::counted;
@@ -24,7 +24,8 @@ use blindgrasp_stages::model::Model;
 #[derive(Debug, Args)]
 #[command(after_help = "Examples: blindgrasp export recordings/held-out.mcap --topic /truth\n          \
                         blindgrasp export data/train --features models/barrett-bh8-280.json --out features.csv\n\n\
-                        A line is {\"topic\", \"seq\", \"stamp_nanos\", \"data\": {…}}; NaN and infinity are null.\n\
+                        A line is {\"topic\", \"seq\", \"stamp_nanos\", \"data\": {…}}; NaN and infinity are null. \
+                        One of a label also says what stable means, if that is known: label is lift or wrench-space.\n\
                         features: a row for each grasp with a label and a contact, of its first settled frame: recording, \
                         grasp_id, object, object_class, stable (1 or 0), hand_id, dictionary_id, then the values as the encoder \
                         sends them, each under its name: hist_3, finger_1.load, spread.position …")]
@@ -107,10 +108,16 @@ fn export_features(arguments: &Arguments, model: &Path, out: &Path) -> anyhow::R
 fn write_lines(recording: &Path, wanted: &[String], to: impl Write) -> anyhow::Result<()> {
     let mut to = BufWriter::new(to);
     let mut topics = BTreeSet::new();
-    for record in RecordingReader::open(recording)? {
+    let reader = RecordingReader::open(recording)?;
+    let label = label_of(recording, &reader)?;
+    for record in reader {
         let (topic, record) = record?;
         if wanted.is_empty() || wanted.contains(&topic) {
-            writeln!(to, "{}", json_line(&topic, &record)?)?;
+            let mut line = json_of(&topic, &record)?;
+            if let (Some(label), Record::Truth(_)) = (label, &record) {
+                line["label"] = label.word().into();
+            }
+            writeln!(to, "{line}")?;
         }
         topics.insert(topic);
     }
@@ -164,8 +171,8 @@ impl Drop for NewFile {
     }
 }
 
-/// A sample as a line of JSON.
-pub(super) fn json_line(topic: &str, record: &Record) -> serde_json::Result<String> {
+/// A sample as JSON.
+pub(super) fn json_of(topic: &str, record: &Record) -> serde_json::Result<Value> {
     let header = record.header();
     let data = record.to_json()?;
     Ok(json!({
@@ -175,6 +182,5 @@ pub(super) fn json_line(topic: &str, record: &Record) -> serde_json::Result<Stri
         "epoch": header.epoch,
         "hand_id": format!("{:016x}", header.hand_id),
         "data": data,
-    })
-    .to_string())
+    }))
 }

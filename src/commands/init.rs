@@ -31,87 +31,52 @@ pub(super) struct Arguments {
     json: bool,
 }
 
-/// The project's files: those that this repository's own default graph consists of.
-const FILES: [File; 10] = [
-    ("dataflow.yaml", include_bytes!("../../dataflow.yaml")),
-    ("dataflow-live.yaml", include_bytes!("../../dataflow-live.yaml")),
-    ("tactile_bridge.py", include_bytes!("../../examples/tactile_bridge.py")),
-    ("dataflow-machines.yaml", include_bytes!("../../dataflow-machines.yaml")),
-    ("hands/barrett-bh8-280.yaml", include_bytes!("../../hands/barrett-bh8-280.yaml")),
-    ("hands/barrett-bh8-280.urdf", include_bytes!("../../hands/barrett-bh8-280.urdf")),
-    ("models/barrett-bh8-280.json", include_bytes!("../../models/barrett-bh8-280.json")),
-    ("models/barrett-bh8-280-lifts.json", include_bytes!("../../models/barrett-bh8-280-lifts.json")),
-    ("recordings/held-out.mcap", include_bytes!("../../recordings/held-out.mcap")),
-    ("README.md", README.as_bytes()),
-];
-
 /// A path in the project, and the content.
 type File = (&'static str, &'static [u8]);
 
+/// Files that have the same path in a project as below a folder of this repository.
+macro_rules! files {
+    ($folder:literal: $($name:literal,)+) => {
+        &[$(($name, include_bytes!(concat!("../../", $folder, $name)))),+]
+    };
+}
+
+/// The project's files: those that this repository's own default graph consists of.
+const FILES: &[File] = files! { "":
+    "dataflow.yaml", "dataflow-live.yaml", "dataflow-machines.yaml",
+    "hands/barrett-bh8-280.yaml", "hands/barrett-bh8-280.urdf",
+    "models/barrett-bh8-280.json", "models/barrett-bh8-280-lifts.json", "recordings/held-out.mcap",
+};
+const MORE_FILES: [File; 2] =
+    [("tactile_bridge.py", include_bytes!("../../examples/tactile_bridge.py")), ("README.md", README.as_bytes())];
+
 /// The bridges of built-in hands.
 const BRIDGES: [(&str, &[File]); 4] = [
-    (
-        "inspire-rh56dftp",
-        &[("bridges/inspire_rh56dftp.py", include_bytes!("../../examples/bridges/inspire_rh56dftp.py")), LINES],
-    ),
+    ("inspire-rh56dftp", files! { "examples/": "bridges/inspire_rh56dftp.py", "bridges/line_protocol.py", }),
     (
         "robotiq-2f85-tsf85",
-        &[
-            ("bridges/robotiq_2f85_tsf85.py", include_bytes!("../../examples/bridges/robotiq_2f85_tsf85.py")),
-            ("bridges/robotiq-2f85-tsf85.yaml", include_bytes!("../../examples/bridges/robotiq-2f85-tsf85.yaml")),
-            LINES,
-        ],
+        files! { "examples/":
+            "bridges/robotiq_2f85_tsf85.py", "bridges/robotiq-2f85-tsf85.yaml", "bridges/line_protocol.py",
+        },
     ),
-    (
-        "unitree-dex3-1",
-        &[("bridges/unitree-dex3-1.yaml", include_bytes!("../../examples/bridges/unitree-dex3-1.yaml"))],
-    ),
-    ("uskin", &[("bridges/uskin.yaml", include_bytes!("../../examples/bridges/uskin.yaml"))]),
+    ("unitree-dex3-1", files! { "examples/": "bridges/unitree-dex3-1.yaml", }),
+    ("uskin", files! { "examples/": "bridges/uskin.yaml", }),
 ];
-const LINES: File = ("bridges/line_protocol.py", include_bytes!("../../examples/bridges/line_protocol.py"));
 
 /// The packages of ROS 2: nodes and messages.
-const ROS2_FILES: [File; 27] = [
-    ("blindgrasp_ros/blindgrasp_ros/line_protocol.py", LINES.1),
-    ("blindgrasp_ros/launch/gate.launch.py", include_bytes!("../../examples/blindgrasp_ros/launch/gate.launch.py")),
-    ("blindgrasp_ros/package.xml", include_bytes!("../../examples/blindgrasp_ros/package.xml")),
-    ("blindgrasp_ros/resource/blindgrasp_ros", include_bytes!("../../examples/blindgrasp_ros/resource/blindgrasp_ros")),
-    ("blindgrasp_ros/setup.cfg", include_bytes!("../../examples/blindgrasp_ros/setup.cfg")),
-    ("blindgrasp_ros/setup.py", include_bytes!("../../examples/blindgrasp_ros/setup.py")),
-    (
-        "blindgrasp_ros/blindgrasp_ros/__init__.py",
-        include_bytes!("../../examples/blindgrasp_ros/blindgrasp_ros/__init__.py"),
-    ),
-    (
-        "blindgrasp_ros/blindgrasp_ros/decisions.py",
-        include_bytes!("../../examples/blindgrasp_ros/blindgrasp_ros/decisions.py"),
-    ),
-    (
-        "blindgrasp_ros/blindgrasp_ros/gripper_gate.py",
-        include_bytes!("../../examples/blindgrasp_ros/blindgrasp_ros/gripper_gate.py"),
-    ),
-    ("blindgrasp_ros/blindgrasp_ros/hand.py", include_bytes!("../../examples/blindgrasp_ros/blindgrasp_ros/hand.py")),
-    (
-        "blindgrasp_ros/blindgrasp_ros/lift_gate.py",
-        include_bytes!("../../examples/blindgrasp_ros/blindgrasp_ros/lift_gate.py"),
-    ),
-    ("blindgrasp_ros/blindgrasp_ros/node.py", include_bytes!("../../examples/blindgrasp_ros/blindgrasp_ros/node.py")),
-    ("blindgrasp_msgs/CMakeLists.txt", include_bytes!("../../examples/blindgrasp_msgs/CMakeLists.txt")),
-    ("blindgrasp_msgs/package.xml", include_bytes!("../../examples/blindgrasp_msgs/package.xml")),
-    ("blindgrasp_msgs/msg/Contact.msg", include_bytes!("../../examples/blindgrasp_msgs/msg/Contact.msg")),
-    ("blindgrasp_msgs/msg/ContactSet.msg", include_bytes!("../../examples/blindgrasp_msgs/msg/ContactSet.msg")),
-    ("blindgrasp_msgs/msg/Decision.msg", include_bytes!("../../examples/blindgrasp_msgs/msg/Decision.msg")),
-    ("blindgrasp_msgs/msg/GraspFeature.msg", include_bytes!("../../examples/blindgrasp_msgs/msg/GraspFeature.msg")),
-    ("blindgrasp_msgs/msg/GraspScene.msg", include_bytes!("../../examples/blindgrasp_msgs/msg/GraspScene.msg")),
-    ("blindgrasp_msgs/msg/GraspTruth.msg", include_bytes!("../../examples/blindgrasp_msgs/msg/GraspTruth.msg")),
-    ("blindgrasp_msgs/msg/Header.msg", include_bytes!("../../examples/blindgrasp_msgs/msg/Header.msg")),
-    ("blindgrasp_msgs/msg/LiftDecision.msg", include_bytes!("../../examples/blindgrasp_msgs/msg/LiftDecision.msg")),
-    ("blindgrasp_msgs/msg/LiftOutcome.msg", include_bytes!("../../examples/blindgrasp_msgs/msg/LiftOutcome.msg")),
-    ("blindgrasp_msgs/msg/Prediction.msg", include_bytes!("../../examples/blindgrasp_msgs/msg/Prediction.msg")),
-    ("blindgrasp_msgs/msg/SceneContact.msg", include_bytes!("../../examples/blindgrasp_msgs/msg/SceneContact.msg")),
-    ("blindgrasp_msgs/msg/TactileFrame.msg", include_bytes!("../../examples/blindgrasp_msgs/msg/TactileFrame.msg")),
-    ("blindgrasp_msgs/srv/Decide.srv", include_bytes!("../../examples/blindgrasp_msgs/srv/Decide.srv")),
-];
+const ROS2_FILES: &[File] = files! { "examples/":
+    "blindgrasp_ros/blindgrasp_ros/line_protocol.py", "blindgrasp_ros/launch/gate.launch.py",
+    "blindgrasp_ros/package.xml", "blindgrasp_ros/resource/blindgrasp_ros", "blindgrasp_ros/setup.cfg",
+    "blindgrasp_ros/setup.py", "blindgrasp_ros/blindgrasp_ros/__init__.py",
+    "blindgrasp_ros/blindgrasp_ros/decisions.py", "blindgrasp_ros/blindgrasp_ros/gripper_gate.py",
+    "blindgrasp_ros/blindgrasp_ros/hand.py", "blindgrasp_ros/blindgrasp_ros/lift_gate.py",
+    "blindgrasp_ros/blindgrasp_ros/node.py", "blindgrasp_msgs/CMakeLists.txt", "blindgrasp_msgs/package.xml",
+    "blindgrasp_msgs/msg/Contact.msg", "blindgrasp_msgs/msg/ContactSet.msg", "blindgrasp_msgs/msg/Decision.msg",
+    "blindgrasp_msgs/msg/GraspFeature.msg", "blindgrasp_msgs/msg/GraspScene.msg",
+    "blindgrasp_msgs/msg/GraspTruth.msg", "blindgrasp_msgs/msg/Header.msg", "blindgrasp_msgs/msg/LiftDecision.msg",
+    "blindgrasp_msgs/msg/LiftOutcome.msg", "blindgrasp_msgs/msg/Prediction.msg",
+    "blindgrasp_msgs/msg/SceneContact.msg", "blindgrasp_msgs/msg/TactileFrame.msg", "blindgrasp_msgs/srv/Decide.srv",
+};
 
 /// The files of a built-in hand and of its bridge.
 fn of_hand(name: &str) -> Vec<(String, &'static [u8])> {
@@ -150,13 +115,14 @@ hand; `blindgrasp --help` lists the rest.
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let folder = &arguments.folder;
-    let mut files: Vec<(String, &[u8])> = FILES.iter().map(|(name, content)| ((*name).to_owned(), *content)).collect();
+    let mut files: Vec<(String, &[u8])> =
+        FILES.iter().chain(&MORE_FILES).map(|(name, content)| ((*name).to_owned(), *content)).collect();
     // The dataflow files name it, for editors.
     files.push(("docs/dataflow.schema.json".into(), SCHEMA.as_bytes()));
     let of_hand: Vec<_> = arguments.hand.iter().flat_map(|hand| of_hand(hand)).collect();
     // The table of a hand's topics is for a node of the package.
     let has_table = of_hand.iter().any(|(name, _)| name.starts_with("bridges/") && name.ends_with(".yaml"));
-    let of_ros2: &[File] = if arguments.ros2 || has_table { &ROS2_FILES } else { &[] };
+    let of_ros2: &[File] = if arguments.ros2 || has_table { ROS2_FILES } else { &[] };
     let of_ros2 = of_ros2.iter().map(|(name, content)| ((*name).to_owned(), *content));
     for file in of_hand.into_iter().chain(of_ros2) {
         if files.iter().all(|(name, _)| *name != file.0) {
@@ -218,7 +184,7 @@ mod tests {
         let mut written = Vec::new();
         for (name, content) in ROS2_FILES {
             let path = examples.join(name);
-            assert!(std::fs::read(&path).expect("readable") == content, "{name} gets the content of another file");
+            assert!(std::fs::read(&path).expect("readable") == *content, "{name} gets the content of another file");
             written.push(path);
         }
         written.sort();

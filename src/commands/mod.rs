@@ -22,7 +22,6 @@ mod ros_messages;
 mod run;
 mod schema;
 mod set;
-mod standard_messages;
 mod stop;
 mod swap;
 mod test;

@@ -10,8 +10,8 @@ use blindgrasp_recording::cdr;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_viewer::Channel;
 
-use super::standard_messages::definition_of;
-
+/// The definition of `visualization_msgs/msg/MarkerArray`, with those of the types in it.
+const MARKER_ARRAY: &str = include_str!("marker_array.msg");
 /// The hand is drawn at most so often: its markers are large.
 const MARKER_PAUSE: Duration = Duration::from_millis(33);
 const POINTS: &str = "/contact_points";
@@ -48,14 +48,14 @@ impl RosMessages {
             }
         }
         let standard = [
-            (POINTS, "sensor_msgs/msg/PointCloud2"),
-            (JOINTS, "sensor_msgs/msg/JointState"),
-            (CELLS, "sensor_msgs/msg/PointCloud2"),
-            (MARKERS, "visualization_msgs/msg/MarkerArray"),
+            (POINTS, "sensor_msgs/msg/PointCloud2", cdr::POINT_CLOUD),
+            (JOINTS, "sensor_msgs/msg/JointState", cdr::JOINT_STATE),
+            (CELLS, "sensor_msgs/msg/PointCloud2", cdr::POINT_CLOUD),
+            (MARKERS, "visualization_msgs/msg/MarkerArray", MARKER_ARRAY),
         ];
-        for (topic, schema) in &standard[..if hand.is_some() { 4 } else { 1 }] {
-            let definition = definition_of(schema).unwrap_or_default();
-            channels.push(Channel { topic: (*topic).into(), schema: (*schema).into(), definition });
+        for (topic, schema, definition) in &standard[..if hand.is_some() { 4 } else { 1 }] {
+            let (topic, schema) = ((*topic).into(), (*schema).into());
+            channels.push(Channel { topic, schema, definition: (*definition).into() });
         }
         let joint_names = hand.iter().flat_map(|hand| &hand.joints).map(|joint| joint.name.clone()).collect();
         let hand_id = hand.map(Hand::id);

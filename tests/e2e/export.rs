@@ -31,7 +31,7 @@ fn lines_to_a_file_are_those_to_stdout() {
     assert_eq!(std::fs::read(&path).expect("written"), stdout);
     let first = &json_lines(&stdout)[0];
     let keys: Vec<_> = first.as_object().expect("an object").keys().map(String::as_str).collect();
-    assert_eq!(keys, ["data", "epoch", "hand_id", "seq", "stamp_nanos", "topic"]);
+    assert_eq!(keys, ["data", "epoch", "hand_id", "label", "seq", "stamp_nanos", "topic"]);
     assert_eq!(names_in(folder.path()), ["truth.jsonl"]);
 }
 

@@ -12,6 +12,7 @@ use blindgrasp_messages::file_kind::FileKind;
 use blindgrasp_messages::files::open_regular;
 use blindgrasp_messages::{GraspTruth, Header, LiftOutcome, OwnedSenses, Phase, Recorded, Stamped, TactileFrame};
 use blindgrasp_stages::Hand;
+use blindgrasp_stages::label::Label;
 use blindgrasp_tactile::cell_zeros::{AllowedReadings, CellZeros};
 use blindgrasp_tactile::{ExpectedHand, line_protocol};
 
@@ -23,26 +24,31 @@ const MAX_BYTES: u64 = 1 << 30;
 const MAX_LINE_BYTES: u64 = 4 << 20;
 
 /// The frames, labels and outcomes of lines.
+#[derive(Default)]
 pub struct FrameLines {
     pub frames: Vec<Stamped<TactileFrame>>,
     /// The labels by number of the grasp and epoch, with their headers if they have lines of their own.
     pub truths: BTreeMap<(u64, u64), (Option<Header>, GraspTruth)>,
     pub outcomes: Vec<Stamped<LiftOutcome>>,
+    /// What stable means in the labels, if a line of `blindgrasp export` says so.
+    pub label: Option<Label>,
+    /// The samples of other topics, which are left out, by topic.
+    pub n_left_out: BTreeMap<String, usize>,
 }
 
 /// A line: a frame, with the label that it reports if it names the object; a label; an outcome; or a sample of another topic.
 enum Line {
     Frame(Stamped<TactileFrame>, Option<GraspTruth>),
-    Truth(Stamped<GraspTruth>),
+    Truth(Stamped<GraspTruth>, Option<Label>),
     Outcome(Stamped<LiftOutcome>),
-    Other,
+    Other(String),
 }
 
 /// Reads a file of lines, or stdin if it is `-`. Empty lines, and samples of other topics, are left out.
 ///
 /// # Errors
-/// A file that is no regular one or has more than 1 GiB, a line of more than 4 MiB or that is no frame, or no frame at all. The
-/// text names the line.
+/// A file that is no regular one or has more than 1 GiB, a line of more than 4 MiB or that is no frame, labels of two meanings, or
+/// no frame at all. The text names the line.
 pub fn read_frames(file: &Path, hand: &Hand) -> anyhow::Result<FrameLines> {
     if let Some(kind) = FileKind::at(file)
         && !matches!(kind, FileKind::FrameLines | FileKind::Json | FileKind::Empty)
@@ -54,8 +60,7 @@ pub fn read_frames(file: &Path, hand: &Hand) -> anyhow::Result<FrameLines> {
         _ => Box::new(BufReader::new(open_regular(file).with_context(|| file.display().to_string())?)),
     };
     let mut input = input.take(MAX_BYTES + 1);
-    let mut frames: Vec<Stamped<TactileFrame>> = Vec::new();
-    let (mut truths, mut outcomes) = (BTreeMap::new(), Vec::new());
+    let mut lines = FrameLines::default();
     // Of lines of a bridge: whether they have numbers.
     let mut has_seq = None;
     let mut zeros = CellZeros::new(hand, false);
@@ -68,40 +73,58 @@ pub fn read_frames(file: &Path, hand: &Hand) -> anyhow::Result<FrameLines> {
         if line.is_empty() {
             continue;
         }
-        let read = read_line(line, &frames, hand, &mut zeros).with_context(place)?;
+        let read = read_line(line, &lines.frames, hand, &mut zeros).with_context(place)?;
         let has_seq_here = line.contains("\"seq\"");
         if !line.contains("\"data\"") && *has_seq.get_or_insert(has_seq_here) != has_seq_here {
             bail!("{}: expected seq in all lines or in none", place());
         }
-        let truth = match read {
-            Line::Frame(frame, truth) => {
-                let epoch = frame.header.epoch;
-                frames.push(frame);
-                truth.map(|truth| (epoch, (None, truth)))
-            }
-            Line::Truth(Stamped { header, message }) => Some((header.epoch, (Some(header), message))),
-            Line::Outcome(outcome) => {
-                outcomes.push(outcome);
-                None
-            }
-            Line::Other => None,
-        };
-        if let Some((epoch, truth)) = truth {
-            truths.entry((truth.1.grasp_id, epoch)).or_insert(truth);
-        }
+        lines.add(read).with_context(place)?;
     }
-    if let (Some(has_seq), Some(first)) = (has_seq, frames.first()) {
+    if let (Some(has_seq), Some(first)) = (has_seq, lines.frames.first()) {
         // As the source of a graph numbers them: if the first frames are missing, so is number 0, and the grasp is held.
         let first_seq = first.header.seq;
         let is_whole = first.message.phase == Phase::Open || (has_seq && first_seq == 0);
-        for frame in &mut frames {
+        for frame in &mut lines.frames {
             frame.header.seq = frame.header.seq.wrapping_sub(first_seq).wrapping_add(u64::from(!is_whole));
         }
     }
-    if frames.is_empty() {
+    if lines.frames.is_empty() {
         bail!("{}: expected lines with tactile frames, found none", file.display());
     }
-    Ok(FrameLines { frames, truths, outcomes })
+    Ok(lines)
+}
+
+impl FrameLines {
+    fn add(&mut self, line: Line) -> anyhow::Result<()> {
+        let (key, truth) = match line {
+            Line::Frame(frame, truth) => {
+                let epoch = frame.header.epoch;
+                self.frames.push(frame);
+                let Some(truth) = truth else { return Ok(()) };
+                ((truth.grasp_id, epoch), (None, truth))
+            }
+            Line::Truth(Stamped { header, message }, label) => {
+                if self.label != label && self.truths.values().any(|(own, _)| own.is_some()) {
+                    bail!("this label is by another rule than those before: give them one by one");
+                }
+                self.label = label;
+                ((message.grasp_id, header.epoch), (Some(header), message))
+            }
+            Line::Outcome(outcome) => {
+                self.outcomes.push(outcome);
+                return Ok(());
+            }
+            Line::Other(topic) => {
+                *self.n_left_out.entry(topic).or_default() += 1;
+                return Ok(());
+            }
+        };
+        // The first label counts, but an object that was kept may be dropped after that.
+        if self.truths.get(&key).is_none_or(|(_, known)| known.stable && !truth.1.stable) {
+            self.truths.insert(key, truth);
+        }
+        Ok(())
+    }
 }
 
 /// The next line; `None` at the end.
@@ -141,7 +164,7 @@ fn read_line(
     if line.topic == GraspTruth::TOPIC {
         let message = serde_json::from_value(line.data)
             .context("not a label: expected grasp_id, epsilon, volume, stable, object and object_class")?;
-        return Ok(Line::Truth(Stamped { header, message }));
+        return Ok(Line::Truth(Stamped { header, message }, line.label));
     }
     if line.topic == LiftOutcome::TOPIC {
         let message =
@@ -149,7 +172,7 @@ fn read_line(
         return Ok(Line::Outcome(Stamped { header, message }));
     }
     if line.topic != TactileFrame::TOPIC {
-        return Ok(Line::Other);
+        return Ok(Line::Other(line.topic));
     }
     let frame: FrameLine = serde_json::from_value(line.data)
         .context("not a tactile frame: expected grasp_id, phase, joints and cells_newtons")?;
@@ -207,6 +230,7 @@ struct ExportedLine {
     #[serde(default)]
     epoch: u64,
     hand_id: Option<String>,
+    label: Option<Label>,
     data: Value,
 }
 

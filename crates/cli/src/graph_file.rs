@@ -166,11 +166,7 @@ fn new_misfits(before: &[Part], after: &[Part]) -> Vec<Misfit> {
     };
     let old = misfits(before);
     let mut new = misfits(after);
-    // The words about a bound name the model and the promise, which may have become better.
-    let is_known = |misfit: &Misfit, of: &Misfit| {
-        of == misfit || (misfit.kind == MisfitKind::Bound && (of.kind, &of.node) == (misfit.kind, &misfit.node))
-    };
-    new.retain(|misfit| !old.iter().any(|of| is_known(misfit, of)));
+    new.retain(|misfit| !old.contains(misfit));
     new
 }
 

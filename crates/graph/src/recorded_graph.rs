@@ -14,12 +14,13 @@ pub fn attached_model(node: &str) -> String {
 }
 
 /// How a recording ended.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Default)]
 #[serde(rename_all = "snake_case")]
 pub enum Ending {
     /// With the graph.
     Graph,
     /// The graph went on.
+    #[default]
     Detached,
     /// With the graph, which failed or was killed: the last samples may be missing.
     Broken,

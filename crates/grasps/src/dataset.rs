@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
-use blindgrasp_messages::{GraspTruth, Phase, Stamped, TactileFrame};
+use blindgrasp_messages::{GraspTruth, Stamped, TactileFrame};
 use blindgrasp_recording::{Record, RecordingError, RecordingReader};
 use blindgrasp_stages::OtherHand;
 use blindgrasp_stages::hand::{Hand, HandError};
@@ -144,11 +144,9 @@ pub fn reported_truth(recording: &Path, grasp_id: u64, is_kept: bool) -> GraspTr
     }
 }
 
-/// The outcome that the frames of a grasp report: the first one counts.
+/// The outcome that the frames of a grasp report: an object that was kept may be dropped after that.
 fn reported_outcome(frames: &[Stamped<TactileFrame>]) -> Option<bool> {
-    let outcome =
-        frames.iter().map(|frame| frame.message.phase).find(|phase| matches!(phase, Phase::Kept | Phase::Dropped))?;
-    Some(outcome == Phase::Kept)
+    frames.iter().filter_map(|frame| frame.message.phase.outcome()).reduce(|is_kept, is_still| is_kept && is_still)
 }
 
 /// Reads a recording's grasps in order. A grasp without a label has the outcome of its lift, if a frame reports it. `reduce` is
@@ -156,7 +154,7 @@ fn reported_outcome(frames: &[Stamped<TactileFrame>]) -> Option<bool> {
 ///
 /// # Errors
 /// The recording cannot be read, was made with another hand, has frames of a grasp on both sides of another grasp, or has
-/// two labels for a grasp.
+/// two labels for a grasp; but a drop may follow an object that was kept.
 pub fn read_grasps<T>(
     path: &Path,
     hand: &Hand,
@@ -182,8 +180,8 @@ pub fn read_grasps<T>(
                 frames.push(frame);
             }
             Record::Truth(truth) => {
-                let grasp_id = truth.message.grasp_id;
-                if truths.insert(grasp_id, truth.message).is_some() {
+                let (grasp_id, is_drop) = (truth.message.grasp_id, !truth.message.stable);
+                if truths.insert(grasp_id, truth.message).is_some_and(|before| !(before.stable && is_drop)) {
                     return Err(unusable(format!("grasp {grasp_id} has two labels (/truth)")));
                 }
             }

@@ -184,8 +184,8 @@ impl RecordingsSummary {
                         self.count_contacts(hand, last.take());
                     }
                     self.n_grasps += usize::from(seen.insert(frame.grasp_id));
-                    if matches!(frame.phase, Phase::Kept | Phase::Dropped) {
-                        reported.entry(frame.grasp_id).or_insert(frame.phase == Phase::Kept);
+                    if let Some(is_kept) = frame.phase.outcome() {
+                        *reported.entry(frame.grasp_id).or_insert(true) &= is_kept;
                     }
                     if frame.phase == Phase::Settled || last.is_none() {
                         last = Some(frame);

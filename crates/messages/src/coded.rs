@@ -248,6 +248,15 @@ impl Phase {
         matches!(self, Phase::Ended | Phase::Kept | Phase::Dropped)
     }
 
+    /// Of a frame that reports how a lift ended, whether its object was kept.
+    pub fn outcome(self) -> Option<bool> {
+        match self {
+            Phase::Kept => Some(true),
+            Phase::Dropped => Some(false),
+            _ => None,
+        }
+    }
+
     /// Whether the hand and the arm are at rest, so that the frame may decide.
     pub fn decides(self) -> bool {
         matches!(self, Phase::Settled | Phase::Squeezed | Phase::TestLifted)

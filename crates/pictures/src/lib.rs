@@ -56,44 +56,17 @@ use blindgrasp_stages::hand::JointError;
 pub enum PictureError {
     /// Nothing was recorded of the grasp.
     #[error("grasp {grasp_id} has no frames: expected at least one")]
-    NoFrames {
-        /// The grasp.
-        grasp_id: u64,
-    },
+    NoFrames { grasp_id: u64 },
     /// The frames are not the hand's.
     #[error("grasp {grasp_id}, frame {idx}: {found} cells, the hand has {expected}")]
-    Cells {
-        /// The grasp.
-        grasp_id: u64,
-        /// Which of its frames.
-        idx: usize,
-        /// Readings found.
-        found: usize,
-        /// The hand's cells.
-        expected: usize,
-    },
+    Cells { grasp_id: u64, idx: usize, found: usize, expected: usize },
     /// The joint angles are not the hand's.
     #[error("grasp {grasp_id}")]
-    Joints {
-        /// The grasp.
-        grasp_id: u64,
-        /// What is wrong with them.
-        source: JointError,
-    },
+    Joints { grasp_id: u64, source: JointError },
     /// The scene names a link that the hand doesn't have.
     #[error("grasp {grasp_id}: a contact of link {found}, the hand has the links 0 to {}", n_links - 1)]
-    Link {
-        /// The grasp.
-        grasp_id: u64,
-        /// The index found.
-        found: i64,
-        /// How many links the hand has.
-        n_links: usize,
-    },
+    Link { grasp_id: u64, found: i64, n_links: usize },
     /// The page's data could not be written as JSON.
     #[error("could not write the page's data")]
-    Data {
-        /// The reason.
-        source: serde_json::Error,
-    },
+    Data { source: serde_json::Error },
 }

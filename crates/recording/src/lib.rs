@@ -41,7 +41,7 @@ use serde::{Deserialize, Serialize};
 /// Messages as CDR, for topics of ROS 2: little-endian, behind the four bytes of its encapsulation.
 pub mod cdr {
     pub use super::types::{decode, encode};
-    pub use super::viewer::{contact_points, force_points, joint_state};
+    pub use super::viewer::{JOINT_STATE, POINT_CLOUD, contact_points, force_points, joint_state};
 }
 
 pub use blindgrasp_messages::Record;

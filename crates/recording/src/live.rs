@@ -58,6 +58,7 @@ pub struct LiveSummary {
 ///
 /// After an error the recording has ended: further samples are counted and refused with the same error, and
 /// [`LiveRecorder::finish`] returns the outcome.
+#[derive(Default)]
 pub struct LiveRecorder {
     path: PathBuf,
     info: BTreeMap<String, String>,
@@ -114,21 +115,8 @@ impl LiveRecorder {
                 return Err(RecordingError::Invalid { path: path.into(), message });
             }
         }
-        let mut recorder = LiveRecorder {
-            path: path.into(),
-            info: info_metadata(info),
-            options,
-            current: None,
-            previous: None,
-            n_parts: 0,
-            recent: RecentGrasps::default(),
-            viewer: ViewerMessages::default(),
-            ended: None,
-            ending: None,
-            summary: LiveSummary::default(),
-            is_last_taken: false,
-            data: Vec::new(),
-        };
+        let mut recorder =
+            LiveRecorder { path: path.into(), info: info_metadata(info), options, ..LiveRecorder::default() };
         recorder.viewer.hand = recorder.options.hand.take();
         if recorder.options.is_split() {
             recorder.clear_old_parts()?;

@@ -113,6 +113,9 @@ pub(super) fn other_version(difference: &str, info: &RecordingInfo) -> String {
         return difference.into();
     }
     let version = &info.version;
+    if version == env!("CARGO_PKG_VERSION") {
+        return format!("{difference}: another build of blindgrasp {version} wrote it; read it with that one");
+    }
     format!(
         "{difference}: blindgrasp {version} wrote it, in another version of the messages; read it with blindgrasp {version}"
     )

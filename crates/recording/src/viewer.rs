@@ -156,7 +156,8 @@ uint32 nanosec
     };
 }
 
-const JOINT_STATE: &str = with_header!(
+/// The definition of `sensor_msgs/msg/JointState`, with those of the types in it.
+pub const JOINT_STATE: &str = with_header!(
     "\
 string[] name
 float64[] position
@@ -165,7 +166,8 @@ float64[] effort
 "
 );
 
-const POINT_CLOUD: &str = with_header!(
+/// The same of `sensor_msgs/msg/PointCloud2`.
+pub const POINT_CLOUD: &str = with_header!(
     "\
 uint32 height
 uint32 width

@@ -9,7 +9,7 @@ use serde::Serialize;
 use super::comparison::{ComparedEdge, EdgeComparison};
 use super::expectations::Expectations;
 use super::rewrite::{FedEdge, Origin};
-use blindgrasp_messages::{Action, GraspScene, GraspTruth, LiftDecision, LiftOutcome, Phase, Reason, Recorded};
+use blindgrasp_messages::{Action, GraspScene, GraspTruth, LiftDecision, LiftOutcome, Reason, Recorded};
 use blindgrasp_operator::text::counted;
 use blindgrasp_recording::{Record, RecordingError, RecordingReader};
 
@@ -204,8 +204,10 @@ impl Decisions {
                 // A probe comes before the decision about its grasp.
                 Record::Decision(sample) if !sample.message.action.decides() => continue,
                 Record::Decision(sample) => read.decisions.insert(sample.message.grasp_id, sample.message).is_some(),
-                Record::Tactile(sample) if matches!(sample.message.phase, Phase::Kept | Phase::Dropped) => {
-                    read.outcomes.insert(sample.message.grasp_id, sample.message.phase == Phase::Kept);
+                Record::Tactile(sample) => {
+                    if let Some(is_kept) = sample.message.phase.outcome() {
+                        *read.outcomes.entry(sample.message.grasp_id).or_insert(true) &= is_kept;
+                    }
                     false
                 }
                 Record::Outcome(sample) if sample.message.lifted => {

@@ -118,7 +118,8 @@ impl Expectations {
     /// # Errors
     /// A text that says what is wrong.
     pub fn parse(text: &str) -> Result<Expectations, String> {
-        let written: Written = serde_saphyr::from_str(text).map_err(|error| with_suggestion(&error.to_string()))?;
+        let written: Written =
+            serde_saphyr::from_str(text).map_err(|error| with_suggestion(&error.without_snippet().to_string()))?;
         if written.version != 1 {
             return Err(format!("version must be 1, found {}", written.version));
         }

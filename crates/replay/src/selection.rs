@@ -40,7 +40,7 @@ pub enum SelectionError {
 }
 
 /// Selects and numbers a recording's samples, one after the other.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub struct Selector {
     selection: Selection,
     first_stamp_nanos: Option<u64>,
@@ -103,16 +103,7 @@ impl fmt::Display for GraspIds {
 
 impl Selector {
     pub fn new(selection: Selection) -> Self {
-        Selector {
-            selection,
-            first_stamp_nanos: None,
-            verdicts: HashMap::new(),
-            remembered: VecDeque::new(),
-            frames: Renumbering::default(),
-            truths: Renumbering::default(),
-            n_truths: 0,
-            waiting: VecDeque::new(),
-        }
+        Selector { selection, ..Selector::default() }
     }
 
     /// Takes the recording's next frame and returns its new number, if it is selected.

@@ -51,6 +51,7 @@ struct Kept {
 }
 
 /// The last seconds of a graph. Times are of CLOCK_BOOTTIME.
+#[derive(Default)]
 pub struct FlightRecorder {
     edges: Vec<KeptEdge>,
     /// The edge with the source's frames.
@@ -73,7 +74,7 @@ pub struct FlightRecorder {
 }
 
 /// The samples for a file, and the facts about it.
-#[derive(Serialize)]
+#[derive(Serialize, Default)]
 pub struct Excerpt {
     /// Empty until it is written.
     pub file: PathBuf,
@@ -106,14 +107,7 @@ impl FlightRecorder {
             edges,
             keep_nanos: keep.as_nanos() as u64,
             after_nanos: after.as_nanos() as u64,
-            samples: VecDeque::new(),
-            n_bytes: 0,
-            is_full: false,
-            grasp: None,
-            dropped: None,
-            last_fault: None,
-            trigger: None,
-            later: None,
+            ..FlightRecorder::default()
         })
     }
 
@@ -208,16 +202,7 @@ impl FlightRecorder {
     fn excerpt(&mut self, until_nanos: u64) -> Option<Excerpt> {
         let Trigger { why, since_nanos, .. } = self.trigger.take()?;
         self.trigger = self.later.take();
-        let mut excerpt = Excerpt {
-            file: PathBuf::new(),
-            why,
-            frames: 0,
-            grasps: 0,
-            secs: 0.0,
-            missing: 0,
-            samples: Vec::new(),
-            ending: Ending::Detached,
-        };
+        let mut excerpt = Excerpt { why, ..Excerpt::default() };
         let held = || self.samples.iter().filter(|kept| kept.edge_idx == self.leader_idx);
         // From the first whole grasp on, unless that began after the moment that is to be kept.
         let has_whole = held().any(|kept| kept.begins_grasp && kept.received_nanos <= since_nanos);

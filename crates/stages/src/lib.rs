@@ -31,7 +31,7 @@
 //! * [`contacts`], [`encoder`] (with [`dictionary`] and [`histogram`]), [`classifier`], [`lift_arbiter`] (with [`lift_watch`]) - the
 //!   stages. [`steps`] - the first three, from message to message.
 //! * [`out_of_distribution`] - whether a grasp is like those that the model was trained on.
-//! * [`odd_readings`] - faults of hands that can be told without training.
+//! * [`odd_readings`] and [`frozen_skin`] - faults of hands that can be told without training.
 //! * [`model`] - the model file. [`recipe`] and [`training_summary`] - how a model was trained, as the file says.
 //! * [`own_lifts`] - corrections of a model by the lifts of its robot. [`promise_monitor`] - whether lifts drop more often than was
 //!   promised, and the bound that they allow.
@@ -46,6 +46,7 @@ pub mod day;
 mod decided;
 pub mod dictionary;
 pub mod encoder;
+pub mod frozen_skin;
 pub mod glitches;
 pub mod hand;
 pub mod histogram;

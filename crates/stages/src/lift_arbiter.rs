@@ -104,6 +104,8 @@ pub struct LiftArbiter {
     broken: Option<(u64, u64, i128)>,
     /// The last grasp that was held for want of good frames, and why, sentence by sentence.
     held: Option<(u64, Vec<String>)>,
+    /// The last decided grasp whose hand has opened, and whether it has settled again after that.
+    reopened: Option<(u64, bool)>,
 }
 
 /// The limit that makes a grasp stale, and what was found.
@@ -168,6 +170,8 @@ pub struct ArbiterState {
     pending_doubt: Option<Reason>,
     /// The last lifted grasp, if its outcome has not come.
     lifted: Option<u64>,
+    /// The last lifted grasp whose object was kept, and the promise before that: it may still be dropped.
+    kept: Option<(u64, PromiseMonitor)>,
     /// The watch of the last lift.
     watch: Option<LiftWatch>,
     /// The lifts that were watched before that one: [`WATCH_COUNTS`](crate::lift_watch::WATCH_COUNTS).
@@ -193,7 +197,7 @@ impl ArbiterState {
 }
 
 /// A grasp that is not decided yet.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Default)]
 struct OpenGrasp {
     /// The epoch of its last prediction.
     epoch: u64,
@@ -325,6 +329,8 @@ enum PhaseMeaning {
 /// How a prediction comes after the one before it.
 struct Arrival {
     break_in_order: Option<Reason>,
+    /// It is of the same hand and run of the source as the one before, and later: no more than frames between them may be lost.
+    is_later: bool,
     /// Why it is stale, if it is.
     stale: Option<Staleness>,
     /// Its numbers may be used.
@@ -384,7 +390,13 @@ impl ArbiterOptions {
 impl LiftArbiter {
     /// An arbiter that has seen nothing.
     pub fn new(options: ArbiterOptions) -> Self {
-        LiftArbiter { options, state: ArbiterState { options, ..ArbiterState::default() }, broken: None, held: None }
+        LiftArbiter {
+            options,
+            state: ArbiterState { options, ..ArbiterState::default() },
+            broken: None,
+            held: None,
+            reopened: None,
+        }
     }
 
     pub fn state(&self) -> &ArbiterState {
@@ -406,12 +418,13 @@ impl LiftArbiter {
     pub fn set_options(&mut self, options: ArbiterOptions) {
         self.options = options;
         if self.state.options.promised_drops != options.promised_drops {
-            self.state.promise = PromiseMonitor::default();
+            (self.state.promise, self.state.kept) = (PromiseMonitor::default(), None);
         }
         // A bound is of lifts by one rule.
         let rule = |of: &ArbiterOptions| (of.lifts_per_object, of.min_probability_stable, of.votes, of.probe);
         if rule(&self.state.options) != rule(&options) {
             self.state.promise.begin_anew();
+            self.state.kept = None;
         }
         if self.state.options != options {
             if let Some(open) = self.state.open.as_mut() {
@@ -435,14 +448,18 @@ impl LiftArbiter {
     ) {
         let options = self.options;
         let arrival = self.arrive(header, prediction, age_nanos);
+        let silence_nanos = self.silence_limit_nanos();
         self.observe_outcome(header, prediction, arrival.break_in_order);
         if let Some(watch) = &mut self.state.watch
             && (arrival.is_new_reading || prediction.phase == Phase::Ended)
         {
-            let is_trusted = arrival.break_in_order.is_none() && arrival.is_valid && arrival.stale.is_none();
-            decisions.extend(watch.on_prediction(header, prediction, is_trusted, options.votes.max(1)));
+            // A frame after a lost one is judged all the same, but an answer is about the last frames.
+            let has_place = arrival.break_in_order.is_none() || arrival.is_later && prediction.phase == Phase::Lifting;
+            let is_trusted = has_place && arrival.is_valid && arrival.stale.is_none();
+            decisions.extend(watch.on_prediction(header, prediction, is_trusted, options.votes.max(1), silence_nanos));
         }
         let Some(open) = self.open((header.epoch, prediction.grasp_id), decisions) else {
+            self.note_reuse(prediction);
             return;
         };
         let meaning = open.meaning_of(prediction.phase);
@@ -485,7 +502,7 @@ impl LiftArbiter {
             self.state.pace = SourcePace::default();
         }
         if let Some(watch) = self.state.watch.as_mut() {
-            watch.forget_votes();
+            watch.miss();
         }
         if self.open((header.epoch, grasp_id), decisions).is_some() {
             decisions.extend(self.hold(Reason::Invalid));
@@ -541,9 +558,12 @@ impl LiftArbiter {
         let state = &mut self.state;
         let is_open = state.open.as_ref().is_some_and(|open| open.grasp_id == grasp_id);
         let mut stale = self.options.staleness_of(header, age_nanos);
-        let mut is_new_reading = true;
+        let (mut is_new_reading, mut is_later) = (true, false);
         if let Some(last) = state.last.replace(*header) {
             is_new_reading = (last.epoch, last.stamp_nanos) != (header.epoch, header.stamp_nanos);
+            is_later = (last.epoch, last.hand_id) == (header.epoch, header.hand_id)
+                && last.seq < header.seq
+                && last.stamp_nanos < header.stamp_nanos;
             if last.epoch != header.epoch {
                 state.pace = SourcePace::default();
             } else if break_in_order.is_none() {
@@ -568,23 +588,46 @@ impl LiftArbiter {
         let is_valid = prediction.decision_value.is_finite()
             && (0.0..=1.0).contains(&prediction.probability_stable)
             && !(prediction.stable && prediction.unsure);
-        Arrival { break_in_order, stale, is_valid, is_new_reading }
+        Arrival { break_in_order, is_later, stale, is_valid, is_new_reading }
     }
 
-    /// Counts the outcome of the last lift, once.
+    /// Counts the outcome of the last lift, once. An object that was kept may be dropped after that, which counts in its place.
     fn observe_outcome(&mut self, header: &Header, prediction: &Prediction, break_in_order: Option<Reason>) {
-        let is_outcome = matches!(prediction.phase, Phase::Kept | Phase::Dropped);
-        let is_of_lift = self.state.lifted == Some(prediction.grasp_id)
-            && self.state.decided.contains((header.epoch, prediction.grasp_id));
-        if !is_outcome || !is_of_lift || break_in_order == Some(Reason::WrongHand) {
+        let Some(is_kept) = prediction.phase.outcome() else { return };
+        let grasp_id = prediction.grasp_id;
+        if !self.state.decided.contains((header.epoch, grasp_id)) || break_in_order == Some(Reason::WrongHand) {
             return;
         }
-        self.state.lifted = None;
-        if prediction.fault == Fault::Changed {
-            self.state.promise.begin_anew();
+        let state = &mut self.state;
+        if state.lifted == Some(grasp_id) {
+            state.lifted = None;
+            if prediction.fault == Fault::Changed {
+                state.promise.begin_anew();
+            }
+            state.kept = is_kept.then(|| (grasp_id, state.promise.clone()));
+        } else if let Some((_, before)) = state.kept.take_if(|(kept, _)| !is_kept && *kept == grasp_id) {
+            state.promise = before;
+        } else {
+            return;
         }
         let ArbiterOptions { promised_drops, lifts_per_object, .. } = self.options;
-        self.state.promise.observe(prediction.phase == Phase::Dropped, promised_drops, lifts_per_object);
+        state.promise.observe(!is_kept, promised_drops, lifts_per_object);
+    }
+
+    /// Takes note of a decided grasp whose hand opens, and of the first frame with which it settles again.
+    fn note_reuse(&mut self, prediction: &Prediction) {
+        let is_known = self.reopened.is_some_and(|(grasp_id, _)| grasp_id == prediction.grasp_id);
+        match prediction.phase {
+            Phase::Open if !is_known => self.reopened = Some((prediction.grasp_id, false)),
+            Phase::Settled if is_known => self.reopened = Some((prediction.grasp_id, true)),
+            _ => {}
+        }
+    }
+
+    /// Whether the hand of this grasp has opened and settled again since it was decided: its source seems to grasp anew under the
+    /// same number, which decides nothing.
+    pub fn is_reused(&self, grasp_id: u64) -> bool {
+        self.reopened == Some((grasp_id, true))
     }
 
     /// The grasp of that number, opened if it is new, after the one before it has been ended; `None` if it is decided.
@@ -606,13 +649,8 @@ impl LiftArbiter {
             epoch,
             grasp_id,
             doubt: pending_doubt.take().or(promise.is_withdrawn().then_some(Reason::PromiseWithdrawn)),
-            stale: None,
-            n_settled: 0,
             awaited: Phase::Settled,
-            is_probe_pending: false,
-            is_before_test_lift: false,
-            made_by: 0,
-            agreeing: None,
+            ..OpenGrasp::default()
         });
         // A source that was started again may go on with the grasp.
         open.epoch = epoch;
@@ -1004,11 +1042,11 @@ mod tests {
     fn a_lift_is_watched_and_neither_lifted_again_nor_lifted_after_a_hold() {
         let mut s = stream(ArbiterOptions::default());
         // It has not begun to lift; then nothing was judged for the last.
-        s.takes("+++[0 Lift Stable]eae[0 GoOn Stable]we[0 GoOn NoAgreement]e[0 GoOn NoAgreement]");
-        // Two are too few, and a fault or a late frame has no vote.
-        s.takes("awwawxwyw");
-        s.takes("wv[0 Tighten Slipping]we[0 GoOn NoAgreement]");
-        s.takes("vvv[0 SetDown Slipping]aev");
+        s.takes("+++[0 Lift Stable]eaaae[0 GoOn Stable]aawe[0 GoOn NoAgreement]e[0 GoOn NoAgreement]");
+        // Two are too few, and a fault or a late frame has no vote and takes none.
+        s.takes("awwawxw");
+        s.takes("yw[0 Tighten Slipping]we[0 GoOn NoAgreement]");
+        s.takes("aaae[0 GoOn Stable]vxvLv[0 SetDown Slipping]aev");
         // A robot that lifts without having been allowed to is not watched; its grasp is held.
         s.takes("N+a[1 Hold NoAgreement]vvv");
         // A lift that was broken off has no outcome that could be missing.
@@ -1016,6 +1054,40 @@ mod tests {
         assert_eq!(s.arbiter.state().n_unreported(), 1);
         // The arm did not lift the other two.
         assert_eq!(s.arbiter.state().watched(), [1, 1]);
+    }
+
+    #[test]
+    fn an_answer_while_the_arm_lifts_is_about_the_last_frames() {
+        for (history, expected) in [
+            ("aaae", Reason::Stable),
+            // Too few, a fault at the end, a lost frame before the question, a question that comes late, and an unreadable frame.
+            ("aae", Reason::NoAgreement),
+            ("aaaaxe", Reason::NoAgreement),
+            ("aaaaLe", Reason::NoAgreement),
+            ("aaaaGe", Reason::NoAgreement),
+            ("aaaaUe", Reason::NoAgreement),
+            ("vvxe", Reason::NoAgreement),
+            ("aLaaae", Reason::Stable),
+        ] {
+            let mut s = stream(ArbiterOptions::default());
+            s.takes("+++[0 Lift Stable]");
+            let said: Vec<LiftDecision> = history.chars().flat_map(|letter| s.take(letter)).collect();
+            let said: Vec<_> = said.iter().map(|decision| (decision.action, decision.reason)).collect();
+            assert_eq!(said, [(Action::GoOn, expected)], "{history}");
+        }
+    }
+
+    #[test]
+    fn a_number_that_is_used_again_is_noticed() {
+        let mut open = prediction('c');
+        open.phase = Phase::Open;
+        let mut s = stream(ArbiterOptions::default());
+        s.takes("c+++[0 Lift Stable]++e");
+        assert_eq!(s.push(open, 0), []);
+        s.takes("cc");
+        assert!(!s.arbiter.is_reused(0));
+        s.takes("+++");
+        assert!(s.arbiter.is_reused(0) && !s.arbiter.is_reused(1));
     }
 
     #[test]
@@ -1038,8 +1110,12 @@ mod tests {
         s.takes("+++[0 Lift Stable]N+++[1 Lift Stable]PdNN+++[2 Lift Stable]k");
         assert_eq!((s.arbiter.state().promise().n_kept, s.arbiter.state().promise().n_dropped), (1, 0));
         assert_eq!(s.arbiter.state().n_unreported(), 2);
-        // An outcome counts once, however often it comes.
-        s.takes("dN+++[3 Lift Stable]dN+++[4 Lift Stable]dN+++[5 Lift Stable]dN+[6 Hold PromiseWithdrawn]++k");
+        // An outcome counts once, however often it comes; but an object that was kept may be dropped later.
+        s.takes("kd");
+        assert_eq!((s.arbiter.state().promise().n_kept, s.arbiter.state().promise().n_dropped), (0, 1));
+        s.takes("dk");
+        assert_eq!((s.arbiter.state().promise().n_kept, s.arbiter.state().promise().n_dropped), (0, 1));
+        s.takes("N+++[3 Lift Stable]dN+++[4 Lift Stable]dN+++[5 Lift Stable]dN+[6 Hold PromiseWithdrawn]++k");
         // It stays withdrawn in another instance, and asks for no probe, until another share is promised.
         let mut next = LiftArbiter::new(ArbiterOptions { probe: Probe::TestLift, ..options });
         next.restore(s.arbiter.state().clone());

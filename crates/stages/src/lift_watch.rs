@@ -3,7 +3,8 @@
 //! The classifier judges each frame of the phase `lifting` by the load that is left
 //! ([`GraspHistory::judge_lifting`](crate::probe::GraspHistory::judge_lifting)). As many consecutive readings as an arbiter
 //! takes votes for a decision ask for a reaction: `tighten` when it is unsure, and `set_down` when it is unstable.
-//! A reading that is faulty, late or out of order has no vote. The watch never lifts: a grasp that was held stays so.
+//! A reading that is faulty, late or older than the last one has no vote, and takes none from those before it. The watch never
+//! lifts: a grasp that was held stays so.
 //!
 //! Fingers that press harder may press a light, smooth object out of the hand. So each `tighten` asks for a step, and another
 //! follows while the load stays low, unless the load has fallen since the step before.
@@ -41,13 +42,15 @@ pub(crate) struct LiftWatch {
     grasp_id: u64,
     /// The operators that made the votes: [`Header::made_by`].
     made_by: u64,
-    /// The latest consecutive readings that are not stable, and those of them that are unstable.
+    /// The latest consecutive votes that are not stable, and those of them that are unstable.
     n_slipping: u32,
     n_unstable: u32,
+    /// The latest consecutive readings that have a stable vote, and the time of the last vote by the source's clock. They are
+    /// those since the source asked.
+    n_stable: u32,
+    voted_nanos: u64,
     probability_stable: f64,
     has_begun: bool,
-    /// Whether a reading has had a vote since the source asked.
-    is_judged: bool,
     /// The orders to tighten; [`TIGHTEN_STEPS`] also once no more may follow.
     n_steps: u32,
     /// The part of the load that was felt at the last order to tighten.
@@ -74,18 +77,24 @@ impl LiftWatch {
 
     /// Starts the counts at zero again.
     pub(crate) fn forget_votes(&mut self) {
-        (self.n_slipping, self.n_unstable) = (0, 0);
+        (self.n_stable, self.n_slipping, self.n_unstable) = (0, 0, 0);
+    }
+
+    /// Takes note of a reading that nobody could judge.
+    pub(crate) fn miss(&mut self) {
+        self.n_stable = 0;
     }
 
     /// Takes a prediction, and returns the action that the arm should take, if any. A prediction that is not trusted has no
     /// vote. `votes` is
-    /// [`ArbiterOptions::votes`](crate::lift_arbiter::ArbiterOptions::votes).
+    /// [`ArbiterOptions::votes`](crate::lift_arbiter::ArbiterOptions::votes), and a vote counts for an answer for `fresh_nanos`.
     pub(crate) fn on_prediction(
         &mut self,
         header: &Header,
         prediction: &Prediction,
         is_trusted: bool,
         votes: u32,
+        fresh_nanos: u64,
     ) -> Option<LiftDecision> {
         let is_of_lift = (header.epoch, prediction.grasp_id) == (self.epoch, self.grasp_id);
         if !is_of_lift || self.is_set_down {
@@ -102,7 +111,8 @@ impl LiftWatch {
                 if self.tightens(votes) { Some(self.says(Action::Tighten, Reason::Slipping)) } else { None }
             }
             Phase::Ended if self.has_begun => {
-                let is_stable = std::mem::take(&mut self.is_judged) && self.n_slipping == 0;
+                let is_fresh = header.stamp_nanos.saturating_sub(self.voted_nanos) <= fresh_nanos;
+                let is_stable = is_trusted && is_fresh && std::mem::take(&mut self.n_stable) >= votes;
                 Some(self.says(Action::GoOn, if is_stable { Reason::Stable } else { Reason::NoAgreement }))
             }
             _ => None,
@@ -125,18 +135,21 @@ impl LiftWatch {
     }
 
     fn count(&mut self, header: &Header, prediction: &Prediction, is_trusted: bool) {
-        // A model agrees with itself only.
-        let is_same = std::mem::replace(&mut self.made_by, header.made_by) == header.made_by;
-        let votes = is_trusted && prediction.fault == Fault::None;
-        let is_slipping = votes && !prediction.stable;
-        let is_unstable = is_slipping && !prediction.unsure;
-        let counted = |n: u32, is_one: bool| if is_one { u32::from(is_same) * n + 1 } else { 0 };
-        self.n_slipping = counted(self.n_slipping, is_slipping);
-        self.n_unstable = counted(self.n_unstable, is_unstable);
-        self.is_judged |= votes;
-        if votes {
-            self.probability_stable = prediction.probability_stable;
+        if !is_trusted || prediction.fault != Fault::None {
+            self.miss();
+            return;
         }
+        // A model agrees with itself only.
+        if std::mem::replace(&mut self.made_by, header.made_by) != header.made_by {
+            self.forget_votes();
+        }
+        let is_unstable = !prediction.stable && !prediction.unsure;
+        let counted = |n: u32, is_one: bool| if is_one { n + 1 } else { 0 };
+        self.n_stable = counted(self.n_stable, prediction.stable);
+        self.n_slipping = counted(self.n_slipping, !prediction.stable);
+        self.n_unstable = counted(self.n_unstable, is_unstable);
+        self.voted_nanos = header.stamp_nanos;
+        self.probability_stable = prediction.probability_stable;
     }
 
     fn says(&self, action: Action, reason: Reason) -> LiftDecision {

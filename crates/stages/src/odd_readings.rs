@@ -43,8 +43,8 @@ pub struct OddReadings {
     joint_ranges: Vec<[f64; 2]>,
     /// The least load of each pad in the open hand; infinity without a frame of it.
     open_newtons: [f64; MAX_PADS],
-    /// The joints of the hand when it had just settled, and the loads of its pads.
-    is_at_rest: bool,
+    /// The phase in which the hand rests, its joints when that had just begun, and the loads of its pads.
+    rest: Option<Phase>,
     rest_joints: Vec<f64>,
     rest_newtons: [f64; MAX_PADS],
     /// For each pad: in how many frames in a row its load has been another one.
@@ -97,19 +97,22 @@ impl OddReadings {
         } else {
             self.cells_newtons.copy_from_slice(cells_newtons);
         }
-        let was_at_rest = std::mem::replace(&mut self.is_at_rest, phase == Phase::Settled);
-        if !self.is_at_rest {
+        let rest = phase.decides().then_some(phase);
+        let was_at_rest = std::mem::replace(&mut self.rest, rest) == rest;
+        if rest.is_none() {
             return;
         }
-        for contact in contacts {
-            self.greatest_newtons = self.greatest_newtons.max(contact.force_newtons);
+        if phase == Phase::Settled {
+            for contact in contacts {
+                self.greatest_newtons = self.greatest_newtons.max(contact.force_newtons);
+            }
         }
         if !was_at_rest {
             self.rest_joints.clear();
             self.rest_joints.extend_from_slice(joints);
             (self.rest_newtons, self.n_changed) = (newtons, [0; MAX_PADS]);
         } else if self.unrest.is_none() {
-            self.unrest = self.find_unrest(hand, joints, &newtons, &steps_newtons);
+            self.unrest = self.find_unrest(hand, phase, joints, &newtons, &steps_newtons);
         }
     }
 
@@ -141,7 +144,7 @@ impl OddReadings {
         }
         self.grasp = Some(grasp);
         (self.n_frames, self.greatest_newtons) = (0, 0.0);
-        (self.is_at_rest, self.unrest) = (false, None);
+        (self.rest, self.unrest) = (None, None);
         self.cells_newtons.clear();
         self.cells_newtons.extend_from_slice(cells_newtons);
         self.changes.clear();
@@ -229,6 +232,7 @@ impl OddReadings {
     fn find_unrest(
         &mut self,
         hand: &Hand,
+        phase: Phase,
         joints: &[f64],
         newtons: &[f64; MAX_PADS],
         steps_newtons: &[f64; MAX_PADS],
@@ -237,9 +241,14 @@ impl OddReadings {
             if (now - before).abs() > AT_REST_RAD * joint.kind.per_radian() {
                 let (name, before, now, unit) = (&joint.name, short(*before), short(*now), joint.kind.unit());
                 return Some(format!(
-                    "joint {name} moves from {before} to {now} {unit} in phase settled: does the phase come early, or do the motors give way?"
+                    "joint {name} moves from {before} to {now} {unit} in phase {}: does the phase come early, or do the motors give way?",
+                    phase.as_str()
                 ));
             }
+        }
+        // An object that slips while it is lifted is what the model judges.
+        if phase != Phase::Settled {
+            return None;
         }
         for (idx, pad) in hand.pads.iter().enumerate() {
             let (before, now) = (self.rest_newtons[idx], newtons[idx]);

@@ -233,6 +233,8 @@ pub struct OwnLifts {
     n_kept: u64,
     n_dropped: u64,
     n_changes: u64,
+    /// The grasp of the last outcome, if its object was kept, and whether that outcome is among `outcomes`.
+    kept: Option<(u64, bool)>,
 }
 
 /// A grasp that is looked at.
@@ -299,7 +301,8 @@ impl OwnLifts {
     }
 
     /// Takes the outcome of a lift. If it looks for changes, it says whether the readings have changed; the outcomes before that
-    /// are forgotten then. The outcome of another grasp, and a second outcome of the same lift, do not count. `classifier` gives
+    /// are forgotten then. The outcome of another grasp does not count, nor does a second outcome of the same lift, unless an object
+    /// that was kept is dropped after that: the drop takes its place. `classifier` gives
     /// the classifier of a look, and the price of a drop for which its threshold was chosen.
     pub(crate) fn lifted<'a>(
         &mut self,
@@ -311,6 +314,14 @@ impl OwnLifts {
         let Some(LookedAt { look, log_odds, is_given_up, settled, .. }) =
             self.grasp.take_if(|known| known.grasp_id == grasp_id)
         else {
+            if let Some((_, has_outcome)) = self.kept.take_if(|(kept, _)| !is_kept && *kept == grasp_id) {
+                (self.n_kept, self.n_dropped) = (self.n_kept - 1, self.n_dropped + 1);
+                if has_outcome && let Some(last) = self.outcomes.back_mut() {
+                    last.is_kept = false;
+                    let look = last.look;
+                    self.learn(look, classifier);
+                }
+            }
             return false;
         };
         let has_changed = looks_for_changes && settled.is_some_and(|settled| self.shift.observe(settled));
@@ -319,6 +330,7 @@ impl OwnLifts {
             (self.n_kept, self.n_dropped, self.n_changes) = (0, 0, self.n_changes + 1);
         }
         *(if is_kept { &mut self.n_kept } else { &mut self.n_dropped }) += 1;
+        self.kept = is_kept.then_some((grasp_id, !is_given_up));
         // The gate would not have lifted it, whatever the last look says.
         if is_given_up {
             return has_changed;
@@ -328,6 +340,12 @@ impl OwnLifts {
         }
         let n_grasps = std::mem::take(&mut self.n_grasps);
         self.outcomes.push_back(Outcome { look, log_odds: log_odds as f32, is_kept, n_grasps });
+        self.learn(look, classifier);
+        has_changed
+    }
+
+    /// Learns from the outcomes of a look, once there are enough.
+    fn learn<'a>(&mut self, look: Phase, classifier: impl Fn(Phase) -> Option<(&'a Classifier, Option<f64>)>) {
         let of_look = || self.outcomes.iter().filter(|outcome| outcome.look == look);
         if of_look().count() >= FEWEST_OUTCOMES
             && let Some((classifier, drop_costs)) = classifier(look)
@@ -338,7 +356,6 @@ impl OwnLifts {
             self.learned.retain(|(known, _)| *known != look);
             self.learned.push((look, learned));
         }
-        has_changed
     }
 }
 
@@ -399,12 +416,18 @@ mod tests {
             lifts.look(looked(grasp_id, Phase::TestLifted, -9.0));
             lifts.lifted(grasp_id + 1, false, true, |_| Some((&own, None)));
             lifts.lifted(grasp_id, grasp_id % 4 != 0, true, |_| Some((&own, None)));
-            lifts.lifted(grasp_id, false, true, |_| Some((&own, None)));
+            lifts.lifted(grasp_id, true, true, |_| Some((&own, None)));
             let has_learned = lifts.learned(Phase::TestLifted).is_some();
             assert_eq!(has_learned, grasp_id + 1 >= FEWEST_OUTCOMES as u64);
         }
         assert_eq!((lifts.n_kept(), lifts.n_dropped()), (30, 10));
         assert_eq!(lifts.learned(Phase::Settled), None);
+        // An object that was kept is dropped after that, which counts once and is learned from.
+        let mut later = lifts.clone();
+        (0..2).for_each(|_| assert!(!later.lifted(39, false, true, |_| Some((&own, None)))));
+        assert_eq!((later.n_kept(), later.n_dropped()), (29, 11));
+        let offset = |of: &OwnLifts| of.learned(Phase::TestLifted).map(|learned| learned.correction.b);
+        assert!(offset(&later) < offset(&lifts));
         let learned = lifts.learned(Phase::TestLifted).expect("learned");
         let probability = 1.0 / (1.0 + libm::exp(-learned.correction.apply(3.0)));
         assert!((0.75..0.9).contains(&probability), "{probability}");

@@ -11,6 +11,7 @@ use blindgrasp_messages::{
 use crate::contacts::{ContactFinder, ContactSummary, clip_to_limits, invalid_reading};
 use crate::day::GraspPlace;
 use crate::encoder::FeltReading;
+use crate::frozen_skin::FrozenSkin;
 use crate::glitches::GlitchFilter;
 use crate::hand::Hand;
 use crate::model::{Memory, Model};
@@ -21,8 +22,9 @@ use crate::out_of_distribution::Violation;
 #[derive(Debug, Default)]
 pub struct ContactMemory {
     pub finder: ContactFinder,
-    /// It is saved with the state of a graph's contacts stage.
+    /// These are saved with the state of a graph's contacts stage.
     pub filter: GlitchFilter,
+    pub frozen: FrozenSkin,
     odd: OddReadings,
 }
 
@@ -31,6 +33,7 @@ impl ContactMemory {
     pub fn odd_readings(&self, hand: &Hand, grasp_id: u64) -> Vec<String> {
         let mut said = self.odd.said(hand, grasp_id);
         said.extend(self.filter.flicker(hand, grasp_id));
+        said.extend(self.frozen.said(grasp_id));
         said
     }
 }
@@ -52,9 +55,13 @@ pub fn find_contacts<'a>(
                 Ok(phase) => memory.filter.steady(hand, place, phase, cells_newtons),
                 Err(_) => cells_newtons,
             };
-            let summary = memory.finder.find(hand, head.header.hand_id, joints, steady, contacts);
+            let mut summary = memory.finder.find(hand, head.header.hand_id, joints, steady, contacts);
             if let (Ok(phase), Fault::None | Fault::NoContact) = (phase, summary.fault) {
                 memory.odd.note(hand, place, phase, (joints, cells_newtons), contacts);
+                if memory.frozen.note(place, phase, cells_newtons, summary.fault == Fault::None) {
+                    summary = ContactSummary { fault: Fault::SensorFault, ..ContactSummary::default() };
+                    contacts.clear();
+                }
             }
             (summary, Some(parts))
         }

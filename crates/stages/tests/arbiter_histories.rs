@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use blindgrasp_messages::{Action, Fault, Header, LiftDecision, Phase, Prediction};
+use blindgrasp_messages::{Action, Fault, Header, LiftDecision, Phase, Prediction, Reason};
 use blindgrasp_stages::lift_arbiter::{ArbiterOptions, LiftArbiter, Probe};
 use rayon::prelude::*;
 
@@ -239,9 +239,6 @@ fn may_react(history: &[Input], lifted: &[(usize, u64)], decision: &LiftDecision
     if grasp.1 != *id || decision.grasp_id != *id || last.grasp() != grasp || !last.is_sample() {
         return false;
     }
-    if decision.action == Action::GoOn {
-        return last.prediction.phase == Phase::Ended;
-    }
     let samples: Vec<&Input> = history.iter().filter(|input| input.is_sample()).collect();
     let readings = samples.windows(2).rev().filter(|pair| {
         let (before, now) = (pair[0].header, pair[1].header);
@@ -249,18 +246,25 @@ fn may_react(history: &[Input], lifted: &[(usize, u64)], decision: &LiftDecision
         let is_of_lift = pair[1].grasp() == grasp && pair[1].prediction.phase == Phase::Lifting && is_new;
         is_of_lift || pair[1].step == 'U'
     });
+    // A frame after a lost one is judged all the same.
+    let has_vote = |pair: &&[&Input]| {
+        let (before, now) = (pair[0].header, pair[1].header);
+        let is_later = (before.epoch, before.hand_id) == (now.epoch, now.hand_id)
+            && (before.seq, before.stamp_nanos) < (now.seq, now.stamp_nanos)
+            && before.stamp_nanos < now.stamp_nanos;
+        (is_later || pair[1].follows(pair[0])) && is_plain_prediction(pair[1], options)
+    };
+    let votes = options.votes as usize;
+    if decision.action == Action::GoOn {
+        let mut latest = readings.take(votes);
+        let are_stable = latest.all(|pair| has_vote(&pair) && pair[1].prediction.stable);
+        return last.prediction.phase == Phase::Ended && (decision.reason == Reason::NoAgreement || are_stable);
+    }
     let is_slipping =
         |prediction: &Prediction| !prediction.stable && (!prediction.unsure || decision.action == Action::Tighten);
-    let votes = options.votes as usize;
-    let n_in_row = readings
-        .take_while(|pair| {
-            let is_same = pair[1].header.made_by == last.header.made_by;
-            pair[1].follows(pair[0])
-                && is_plain_prediction(pair[1], options)
-                && is_same
-                && is_slipping(&pair[1].prediction)
-        })
-        .count();
+    let is_same = |pair: &&[&Input]| pair[1].header.made_by == last.header.made_by;
+    let n_in_row =
+        readings.filter(has_vote).take_while(|pair| is_same(pair) && is_slipping(&pair[1].prediction)).count();
     // Between two steps there are twice as many readings as votes.
     let is_time = decision.action == Action::SetDown || n_in_row % (2 * votes) == votes;
     n_in_row >= votes && is_time && last.prediction.phase == Phase::Lifting

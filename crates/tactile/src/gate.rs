@@ -48,7 +48,7 @@ const N_DOUBTED: u32 = 3;
 const SEQ_JUMP: u64 = 100;
 
 /// The numbers of values in a frame.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Shape {
     pub n_joints: usize,
     pub n_cells: usize,
@@ -109,7 +109,7 @@ pub struct Accepted {
 }
 
 /// Accepts or refuses readings, one after the other.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub struct FrameFilter {
     shape: Shape,
     /// Forces where it is absent.
@@ -193,21 +193,13 @@ impl FrameFilter {
     ) -> Self {
         FrameFilter {
             shape,
-            allowed: None,
             max_delay_nanos,
             wall_offset_nanos,
-            counts: Counts::default(),
             place,
             last_seq,
-            n_skipped: 0,
-            n_unnumbered: 0,
-            connection: Connection::default(),
             delay: place.delay_nanos.map(|(least_nanos, at_nanos)| Delay { least_nanos, at_nanos }),
             stamp_nanos: place.stamp_nanos,
-            new_clock: None,
-            doubt: None,
-            waiting: None,
-            released: None,
+            ..FrameFilter::default()
         }
     }
 

@@ -117,11 +117,7 @@ fn with_missing<'de, D: serde::Deserializer<'de>>(deserializer: D) -> Result<Vec
 impl Reading {
     /// The outcome of a lift whose object the frame names, as a label of its grasp.
     pub fn truth(&self, grasp_id: u64) -> Option<GraspTruth> {
-        let stable = match self.phase {
-            Phase::Kept => true,
-            Phase::Dropped => false,
-            _ => return None,
-        };
+        let stable = self.phase.outcome()?;
         let object = self.object.clone()?;
         let object_class = object.clone();
         Some(GraspTruth { grasp_id, epsilon: f64::NAN, volume: f64::NAN, stable, object, object_class })

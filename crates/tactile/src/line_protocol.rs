@@ -135,7 +135,7 @@ fn is_zero(number: &u64) -> bool {
 }
 
 /// Cuts bytes into lines, in bounded memory: a line that is too long becomes one [`Piece::TooLong`].
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub struct LineSplitter {
     buffer: Vec<u8>,
     /// The buffer holds bytes from `start`, where a line begins, to `end`.
@@ -165,17 +165,7 @@ pub enum Piece<'a> {
 impl LineSplitter {
     /// A splitter for lines of at most `max_line_bytes`, without their end.
     pub fn new(max_line_bytes: usize) -> Self {
-        LineSplitter {
-            buffer: vec![0; max_line_bytes + READ_BYTES],
-            start: 0,
-            end: 0,
-            scanned: 0,
-            max_line_bytes,
-            is_skipping: false,
-            read_at: 0,
-            read_since_nanos: 0,
-            carried_since_nanos: 0,
-        }
+        LineSplitter { buffer: vec![0; max_line_bytes + READ_BYTES], max_line_bytes, ..LineSplitter::default() }
     }
 
     /// Room for the next read. Call it only after [`LineSplitter::next_piece`] returned `None`.

@@ -9,6 +9,7 @@ use blindgrasp_cli::frame_lines::{FrameLines, read_frames};
 use blindgrasp_cli::joint;
 use blindgrasp_learning::file_name;
 use blindgrasp_learning::import::{Day, ImportOptions, ImportReport, Joints, import_frames, import_table};
+use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::text::counted;
 use blindgrasp_stages::hand::Hand;
 
@@ -128,9 +129,12 @@ fn import_lines(arguments: &Arguments, hand: &Hand) -> anyhow::Result<Outcome> {
     // Stdin has no name.
     let inputs: &[PathBuf] = if arguments.table.is_file() { std::slice::from_ref(&arguments.table) } else { &[] };
     check_new(&arguments.out, inputs, arguments.overwrite)?;
-    let FrameLines { frames, truths, outcomes } = read_frames(&arguments.table, hand)?;
+    let FrameLines { frames, truths, outcomes, label, n_left_out } = read_frames(&arguments.table, hand)?;
     let name = file_name(&arguments.table);
-    let report = import_frames(&name, hand, &frames, &truths, &outcomes, &arguments.out)?;
+    let report = import_frames(&name, hand, &frames, &truths, &outcomes, label, &arguments.out)?;
+    for (topic, n) in &n_left_out {
+        print_diagnostic(&format!("{n} samples of {topic} are left out"));
+    }
     if arguments.json {
         print_text(&serde_json::to_string_pretty(&report)?)?;
         return Ok(Outcome::Done);
@@ -140,6 +144,7 @@ fn import_lines(arguments: &Arguments, hand: &Hand) -> anyhow::Result<Outcome> {
         ("grasps", format!("{} in {} frames", report.n_grasps, report.n_frames)),
         ("outcomes", format!("{} kept, {} dropped", report.n_kept, report.n_dropped)),
         ("objects", format!("{} named", report.n_objects)),
+        ("without frames", format!("{} labels or outcomes, which are left out", report.n_without_frames)),
         ("senses", if report.senses.is_empty() { "none".into() } else { report.senses.join(", ") }),
     ] {
         print_line(&format!("{what:<17} {value}"))?;

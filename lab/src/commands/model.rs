@@ -10,8 +10,9 @@ use super::train::{is_of_the_papers_label, probe_lines, threshold_line};
 use super::{Outcome, check_new, completions, number_in, percent, print_line, print_text};
 use blindgrasp_grasps::dataset::{hand_of, label_line};
 use blindgrasp_learning::plain_rule::plain_rule;
-use blindgrasp_learning::training::adapt;
+use blindgrasp_learning::training::{adapt, counts};
 use blindgrasp_messages::Phase;
+use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::text::counted;
 use blindgrasp_recording::recordings_in;
 use blindgrasp_stages::classifier::boosting::BoostedTrees;
@@ -137,11 +138,27 @@ fn adapt_model(arguments: &AdaptArguments) -> anyhow::Result<Outcome> {
     let inputs = [recordings.as_slice(), std::slice::from_ref(&arguments.model)].concat();
     check_new(&arguments.out, &inputs, arguments.overwrite)?;
     let robots: Vec<String> = recordings.iter().map(|path| robot_of(path, &arguments.recordings)).collect();
-    let model = adapt(&hand, &Model::load(&arguments.model)?, &recordings, &robots)?;
+    let before = Model::load(&arguments.model)?;
+    let model = adapt(&hand, &before, &recordings, &robots)?;
     model.save(&arguments.out)?;
     let lines: Vec<String> = recalibration_line(&model).into_iter().chain(own_lifts_lines(&model)).collect();
     print_text(&format!("{}: {}", arguments.out.display(), lines.join("\n")))?;
+    if let Some((estimate, bound)) = refuted(&before, &model) {
+        let [estimate, bound] = [estimate, bound].map(|share| percent(Some(share)));
+        print_diagnostic(&format!(
+            "warning: of the lifts that it makes {estimate} drop, and the model before promised at most {bound}: learn anew with \
+             these lifts (blindgrasp train), or lift surer grasps only (blindgrasp set lift_arbiter.min_probability_stable)"
+        ));
+    }
     Ok(Outcome::Done)
+}
+
+/// The share of the own lifts that drop, and the bound of the model before, if they refute it.
+fn refuted(before: &Model, adapted: &Model) -> Option<(f64, f64)> {
+    let own = adapted.training.own_lifts.as_ref()?;
+    let policy = before.training.policies.iter().find(|policy| policy.look == own.look)?;
+    let (estimate, bound) = (own.promise?.drops_of_lifts.estimate, policy.promise?.drops_of_lifts.at_most);
+    (estimate > bound).then_some((estimate, bound))
 }
 
 /// The name of the robot of a recording: the path of the file, without the number of a part, or the folder that was named.
@@ -202,8 +219,7 @@ fn own_lifts_lines(model: &Model) -> Vec<String> {
     )];
     if !own.taught_nothing.is_empty() {
         let n: usize = own.taught_nothing.values().sum();
-        let reasons: Vec<String> = own.taught_nothing.iter().map(|(reason, n)| format!("{n} {reason}")).collect();
-        lines.push(format!("{n} other grasps taught nothing: {}", reasons.join(", ")));
+        lines.push(format!("{n} other grasps taught nothing: {}", counts(&own.taught_nothing)));
     }
     if own.n_outside > 0 {
         lines.push(format!("limits are wider, because they held {} of these grasps", own.n_outside));
@@ -365,7 +381,7 @@ fn described(model: &Model) -> Vec<(&'static str, String)> {
         ("predictor", classifier.predictor.summary()),
         ("calibration", format!("Platt, a {:.4}, b {:.4}", classifier.calibration.a, classifier.calibration.b)),
         ("threshold", threshold_line(classifier)),
-        ("checksum", model.checksum.clone()),
+        ("checksum", if model.checksum.is_empty() { "not saved".into() } else { model.checksum.clone() }),
     ];
     if training.n_grasps > 0 {
         described.extend(of_training(training, training_range));

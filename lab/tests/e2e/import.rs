@@ -241,6 +241,35 @@ fn labels_of_exported_lines_keep_stamp_and_epoch() {
     let mut expected = json_lines(lines.as_bytes());
     expected.retain(|line| line["topic"] == "/truth");
     assert_eq!(folder.exported("/truth"), expected);
+    // The paper's label is no outcome of a lift, and stays what it is.
+    let exported = text(&run(&["export", "recordings/held-out.mcap"], 0).stdout);
+    let file = folder.write("held-out.jsonl", exported.clone());
+    let lines_only =
+        ["import", "--lines", &file, "--hand", HAND, "--overwrite", "--json", "--out", &folder.at("out.mcap")];
+    let output = run(&lines_only, 0);
+    assert_eq!(text(&output.stderr), "240 samples of /scene are left out\n");
+    let report: Value = serde_json::from_slice(&output.stdout).expect("a report");
+    assert_eq!(
+        (&report["n_kept"], &report["n_dropped"], &report["n_without_frames"]),
+        (&json!(0), &json!(0), &json!(0))
+    );
+    let mut expected = json_lines(exported.as_bytes());
+    expected.retain(|line| line["topic"] == "/truth");
+    assert_eq!(expected[0]["label"], "wrench-space");
+    assert_eq!(folder.exported("/truth"), expected);
+    // Labels of two rules are no recording, and those without frames are counted.
+    folder.write("held-out.jsonl", exported.replacen("wrench-space", "lift", 1));
+    assert!(text(&run(&lines_only, 1).stderr).contains("this label is by another rule than those before"));
+    let one: String = exported
+        .lines()
+        .filter(|line| line.contains("/truth") || line.contains("\"grasp_id\":0,"))
+        .map(|line| line.to_string() + "\n")
+        .collect();
+    folder.write("held-out.jsonl", one);
+    assert_eq!(
+        serde_json::from_slice::<Value>(&run(&lines_only, 0).stdout).expect("a report")["n_without_frames"],
+        239
+    );
 }
 
 #[test]

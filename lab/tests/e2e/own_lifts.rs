@@ -63,6 +63,18 @@ fn the_outcomes_of_a_bridge_are_labels_and_correct_a_model() {
     assert_eq!(report["n_kept"].as_u64().zip(report["n_dropped"].as_u64()).map(|(a, b)| a + b), Some(600));
     let (own, _) = imported("own", &bridge_lines(2, 300, 0.4, true), 0);
     let (nameless, _) = imported("nameless", &bridge_lines(3, 60, 0.4, false), 0);
+    // An object that was kept may fall before the arm has put it down.
+    let lines = bridge_lines(2, 300, 0.4, true);
+    let fallen = |line: &str| {
+        if line.contains("kept") {
+            format!("{line}\n{}\n", line.replace("kept", "dropped"))
+        } else {
+            format!("{line}\n")
+        }
+    };
+    let (fell, output) = imported("fell", &lines.lines().map(fallen).collect::<String>(), 0);
+    assert_eq!(serde_json::from_slice::<Value>(&output.stdout).expect("a report")["n_dropped"], 300);
+    assert_eq!(json_of(&["info", &fell, "--hand", &hand, "--json"])["n_stable"], 0);
 
     // Outcomes are labels for training, evaluation and description.
     let model = at("model.json");

@@ -107,7 +107,8 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     }
     let mut cases: Vec<Case> = Vec::new();
     for recording in &recordings {
-        let case = runner.test(recording, arguments.update)?;
+        // Those before a stop are reported.
+        let Some(case) = runner.test(recording, arguments.update) else { break };
         if !arguments.json {
             // Without a reader, the exit code still tells failures.
             let _ = report::print_case(&case);
@@ -123,6 +124,10 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let printed = report::print_summary(&cases, arguments.json);
     if let Some(folder) = &arguments.keep {
         print_diagnostic(&format!("kept in {}", folder.display()));
+    }
+    if cases.len() < recordings.len() {
+        let _ = printed;
+        bail!("stopped after {} of {} recordings", cases.len(), recordings.len());
     }
     match cases.iter().filter(|case| !case.has_passed()).count() {
         0 => printed.map(|()| Outcome::Done),

@@ -34,7 +34,7 @@ const MAX_READINGS: u64 = 2_000_000;
 const BEHIND_NANOS: u64 = 60_000_000_000;
 
 /// A grasp in the list of the page.
-#[derive(Debug, Clone, Serialize)]
+#[derive(Debug, Clone, Serialize, Default)]
 struct Listed {
     /// Its number, as text: JavaScript has no integers beyond 2^53.
     id: String,
@@ -104,15 +104,8 @@ fn list(recording: &Path) -> anyhow::Result<BTreeMap<GraspKey, Listed>> {
         let stamp = sample.header.stamp_nanos;
         let grasp = list.entry((sample.header.epoch, sample.grasp_id)).or_insert_with(|| Listed {
             id: sample.grasp_id.to_string(),
-            epoch: String::new(),
-            n_frames: 0,
-            action: None,
-            reason: None,
-            probability_stable: None,
-            truth: None,
-            object: String::new(),
             stamps_nanos: [stamp; 2],
-            decided_nanos: None,
+            ..Listed::default()
         });
         grasp.stamps_nanos = [grasp.stamps_nanos[0].min(stamp), grasp.stamps_nanos[1].max(stamp)];
         if sample.schema == TactileFrame::SCHEMA {

@@ -9,7 +9,7 @@ pub(super) use blindgrasp_operator::text::{did_you_mean_or_list, list, quote_pat
 use crate::dataflow::settings::Override;
 
 /// A place in a dataflow file.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
 pub struct Position {
     /// Line, from 1.
     pub line: usize,

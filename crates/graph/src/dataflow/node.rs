@@ -51,7 +51,7 @@ pub(super) const MAX_MEMORY_MIB: i64 = 1 << 20;
 /// Supervision counts in milliseconds, so a shorter window would be empty.
 pub(super) const MIN_WINDOW_SECS: f64 = 0.001;
 
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub(super) struct NodeEntry {
     pub(super) id: Text,
     /// The operator; `None` if it could not be read.
@@ -110,23 +110,14 @@ impl NodeEntry {
     fn new(id: Text) -> NodeEntry {
         NodeEntry {
             run: Some(id.clone()),
-            on: None,
-            has_on: false,
             args: Some(Vec::new()),
-            inputs: Vec::new(),
-            params: Vec::new(),
-            restart: Restart::default(),
             heartbeat_millis: Some(DEFAULT_HEARTBEAT_MILLIS),
-            sandbox: Sandbox::default(),
-            memory_max_mib: None,
-            process: ProcessOptions::default(),
             wait_at: id.at,
             group_at: id.at,
-            pins: Vec::new(),
             inputs_at: id.at,
             params_at: id.at,
-            is_damaged: false,
             id,
+            ..NodeEntry::default()
         }
     }
 

@@ -39,7 +39,7 @@ pub(super) struct Entry {
 }
 
 /// A piece of text and where it stands.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub(super) struct Text {
     pub(super) text: String,
     pub(super) at: Position,

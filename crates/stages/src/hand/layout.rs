@@ -96,7 +96,7 @@ pub(super) fn parse(path: &Path, text: &str) -> Result<Layout, HandError> {
     }
     let options = serde_saphyr::options! { budget: serde_saphyr::budget! { max_nodes: MAX_NODES } };
     let layout: Layout = serde_saphyr::from_str_with_options(text, options)
-        .map_err(|error| invalid(format!("not a pad layout: {error}")))?;
+        .map_err(|error| invalid(format!("not a pad layout: {}", error.without_snippet())))?;
     if layout.format != FORMAT {
         return Err(invalid(format!("format '{}', expected '{FORMAT}'", layout.format)));
     }

@@ -71,7 +71,8 @@ fn read_tree(
     let roots: Vec<_> = robot.links.iter().filter(|link| !joint_above.contains_key(link.name.as_str())).collect();
     let [root] = roots[..] else {
         let names: Vec<_> = roots.iter().map(|link| format!("'{}'", link.name)).collect();
-        return Err(format!("expected one root link (child of no joint), found {}", names.join(", ")));
+        let found = if names.is_empty() { "none, as its joints form a loop".into() } else { names.join(", ") };
+        return Err(format!("expected one root link (child of no joint), found {found}"));
     };
     let joints = motions(&robot.joints)?;
     let mut tree =

@@ -7,27 +7,20 @@
 
 use nalgebra::{Isometry3, Point3, UnitQuaternion, UnitVector3, Vector3};
 use parry3d_f64::math::Vector;
-use serde::{Deserialize, Serialize};
 
 use super::distance::{ClosestPoints, PlacedShape};
 use super::mechanism::Mechanism;
-use super::option_check::{OptionError, positive, require};
+use super::option_check::{OptionError, positive, require, with_defaults};
 use blindgrasp_objects::Object;
 use blindgrasp_stages::hand::pose_from_isometry;
 
-/// How a link's patch becomes points.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct ContactOptions {
-    /// At most so many points a link. 3: a face on a face needs three to resist tilting.
-    pub contacts_per_link: usize,
-    /// Points of a link nearer to each other than this are one. 5 mm: about a finger's cell.
-    pub separation_m: f64,
-}
-
-impl Default for ContactOptions {
-    fn default() -> Self {
-        ContactOptions { contacts_per_link: 3, separation_m: 0.005 }
+with_defaults! {
+    /// How a link's patch becomes points.
+    pub struct ContactOptions {
+        /// At most so many points a link. 3: a face on a face needs three to resist tilting.
+        pub contacts_per_link: usize = 3,
+        /// Points of a link nearer to each other than this are one. 5 mm: about a finger's cell.
+        pub separation_m: f64 = 0.005,
     }
 }
 

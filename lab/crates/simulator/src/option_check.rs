@@ -31,3 +31,22 @@ pub(crate) fn not_negative(option: &'static str, value: f64) -> Result<(), Optio
 pub(crate) fn share(option: &'static str, value: f64) -> Result<(), OptionError> {
     require(option, value, (0.0..=1.0).contains(&value), "a number from 0 to 1")
 }
+
+/// Declares options with their defaults: `pub name: Type = default`.
+macro_rules! with_defaults {
+    ($(#[$meta:meta])* pub struct $name:ident {
+        $($(#[$field_meta:meta])* pub $field:ident: $type:ty = $default:expr,)+
+    }) => {
+        $(#[$meta])*
+        #[derive(Debug, Clone, PartialEq, serde::Serialize, serde::Deserialize)]
+        #[serde(default, deny_unknown_fields)]
+        pub struct $name { $($(#[$field_meta])* pub $field: $type,)+ }
+
+        impl Default for $name {
+            fn default() -> Self {
+                $name { $($field: $default,)+ }
+            }
+        }
+    };
+}
+pub(crate) use with_defaults;

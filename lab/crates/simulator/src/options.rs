@@ -1,9 +1,7 @@
 //! The options of a simulation, and their checks.
 
-use serde::{Deserialize, Serialize};
-
 use super::contact_points::ContactOptions;
-use super::option_check::{OptionError, not_negative, require, share};
+use super::option_check::{OptionError, not_negative, require, share, with_defaults};
 use super::planner::PlannerOptions;
 use super::protocol::ProtocolOptions;
 use super::soft_finger::SoftFingerOptions;
@@ -13,68 +11,46 @@ use crate::trial::{PhysicsEngine, PhysicsOptions, TrialProtocol, check_planner};
 use blindgrasp_stages::hand::{CellUnit, Hand};
 use blindgrasp_stages::label::Label;
 
-/// All options of a simulation.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct SimulatorOptions {
-    /// Number of grasps to keep.
-    pub n_grasps: usize,
-    /// Seed of everything random.
-    pub seed: u64,
-    /// The meaning of stable. A lift takes 0.3 to 0.6 s of CPU time a candidate.
-    #[serde(skip_serializing_if = "Label::is_default")]
-    pub label: Label,
-    /// The least epsilon and volume of a stable grasp, with label `wrench-space`.
-    #[serde(skip_serializing_if = "Thresholds::is_default")]
-    pub thresholds: Thresholds,
-    /// Share of stable grasps among those kept, rounded to whole grasps; `None` keeps the natural share. 0.48, as in the
-    /// paper.
-    pub stable_fraction: Option<f64>,
-    /// Grasps of a part, which is the unit that machines share and that is made again after an interruption. 500: seconds
-    /// of work.
-    pub grasps_per_part: usize,
-    /// The simulation gives up after so many candidates per grasp asked for, and 1000 more. 50: a stable fraction of 0.48 is
-    /// then reached down to a natural share of 1 %.
-    pub max_candidates_per_grasp: usize,
-    /// Coulomb friction of every contact, at most 10. 1.0: rubber on wood (the paper). With label `lift` it is that of the physics, and
-    /// epsilon and volume are still those of 1.0.
-    pub friction: f64,
-    /// What differs from lift to lift, with label `lift`.
-    #[serde(skip_serializing_if = "LiftOptions::is_default")]
-    pub lift: LiftOptions,
-    /// Options of the exploration.
-    pub protocol: ProtocolOptions,
-    /// Options of the planner, which the protocol's approach `planned` uses.
-    pub planner: PlannerOptions,
-    /// Options of the contact points.
-    pub contacts: ContactOptions,
-    /// Options of the rubber.
-    pub soft_finger: SoftFingerOptions,
-    /// Options of cells and encoders.
-    pub sensor: SensorOptions,
-    /// Numbers of frames.
-    pub frames: FrameOptions,
-}
-
-impl Default for SimulatorOptions {
-    fn default() -> Self {
-        SimulatorOptions {
-            n_grasps: 1000,
-            seed: 0,
-            label: Label::default(),
-            thresholds: Thresholds::default(),
-            stable_fraction: Some(0.48),
-            grasps_per_part: 500,
-            max_candidates_per_grasp: 50,
-            friction: 1.0,
-            lift: LiftOptions::default(),
-            protocol: ProtocolOptions::default(),
-            planner: PlannerOptions::default(),
-            contacts: ContactOptions::default(),
-            soft_finger: SoftFingerOptions::default(),
-            sensor: SensorOptions::default(),
-            frames: FrameOptions::default(),
-        }
+with_defaults! {
+    /// All options of a simulation.
+    pub struct SimulatorOptions {
+        /// Number of grasps to keep.
+        pub n_grasps: usize = 1000,
+        /// Seed of everything random.
+        pub seed: u64 = 0,
+        /// The meaning of stable. A lift takes 0.3 to 0.6 s of CPU time a candidate.
+        #[serde(skip_serializing_if = "Label::is_default")]
+        pub label: Label = Label::default(),
+        /// The least epsilon and volume of a stable grasp, with label `wrench-space`.
+        #[serde(skip_serializing_if = "Thresholds::is_default")]
+        pub thresholds: Thresholds = Thresholds::default(),
+        /// Share of stable grasps among those kept, rounded to whole grasps; `None` keeps the natural share. 0.48, as in the
+        /// paper.
+        pub stable_fraction: Option<f64> = Some(0.48),
+        /// Grasps of a part, which is the unit that machines share and that is made again after an interruption. 500: seconds
+        /// of work.
+        pub grasps_per_part: usize = 500,
+        /// The simulation gives up after so many candidates per grasp asked for, and 1000 more. 50: a stable fraction of 0.48 is
+        /// then reached down to a natural share of 1 %.
+        pub max_candidates_per_grasp: usize = 50,
+        /// Coulomb friction of every contact, at most 10. 1.0: rubber on wood (the paper). With label `lift` it is that of the physics, and
+        /// epsilon and volume are still those of 1.0.
+        pub friction: f64 = 1.0,
+        /// What differs from lift to lift, with label `lift`.
+        #[serde(skip_serializing_if = "LiftOptions::is_default")]
+        pub lift: LiftOptions = LiftOptions::default(),
+        /// Options of the exploration.
+        pub protocol: ProtocolOptions = ProtocolOptions::default(),
+        /// Options of the planner, which the protocol's approach `planned` uses.
+        pub planner: PlannerOptions = PlannerOptions::default(),
+        /// Options of the contact points.
+        pub contacts: ContactOptions = ContactOptions::default(),
+        /// Options of the rubber.
+        pub soft_finger: SoftFingerOptions = SoftFingerOptions::default(),
+        /// Options of cells and encoders.
+        pub sensor: SensorOptions = SensorOptions::default(),
+        /// Numbers of frames.
+        pub frames: FrameOptions = FrameOptions::default(),
     }
 }
 
@@ -132,18 +108,13 @@ impl SimulatorOptions {
     }
 }
 
-/// A grasp is stable if both its qualities exceed these. Those of Dang & Allen (section IV) were chosen for a hand of
-/// three fingers.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct Thresholds {
-    pub epsilon: f64,
-    pub volume: f64,
-}
-
-impl Default for Thresholds {
-    fn default() -> Self {
-        Thresholds { epsilon: STABLE_EPSILON, volume: STABLE_VOLUME }
+with_defaults! {
+    /// A grasp is stable if both its qualities exceed these. Those of Dang & Allen (section IV) were chosen for a hand of
+    /// three fingers.
+    #[derive(Copy)]
+    pub struct Thresholds {
+        pub epsilon: f64 = STABLE_EPSILON,
+        pub volume: f64 = STABLE_VOLUME,
     }
 }
 
@@ -164,63 +135,41 @@ impl Thresholds {
     }
 }
 
-/// What differs from lift to lift, so that a model does not learn what a robot does not know.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct LiftOptions {
-    /// The physics engine.
-    pub engine: PhysicsEngine,
-    /// Range of a factor on the friction, uniform. `[1, 1]`: none.
-    pub friction_factor: [f64; 2],
-    /// Range of a factor on the object's mass, its logarithm uniform. `[1, 1]`: none.
-    pub mass_factor: [f64; 2],
-    /// Largest distance by which the centre of mass is off the object's own, uniform over the ball: contents. 0: none.
-    pub centre_shift_m: f64,
-    /// Range of the radius of the table or post on which the object stands, its logarithm uniform. As in trials.
-    pub stand_radius_m: [f64; 2],
-    /// Range of a factor on the forces with which the fingers close and grip, its logarithm uniform. `[1, 1]`: none.
-    pub force_factor: [f64; 2],
-    /// Range of a factor on the fingers' closing speed, its logarithm uniform. `[1, 1]`: none.
-    pub speed_factor: [f64; 2],
-    /// Range of a factor on the stiffness of the rubber that spreads a force over cells, its logarithm uniform. `[1, 1]`: none.
-    pub rubber_factor: [f64; 2],
-    /// Range of a factor on how fast contacts give way, its logarithm uniform: 0.5 is four times as soft. `[1, 1]`: none.
-    pub contact_factor: [f64; 2],
-    /// Range of a factor on the stiffness of the gears between motors and joints, its logarithm uniform. `[1, 1]`: none.
-    pub gear_factor: [f64; 2],
-    /// Share of the lifts in which contacts creep, with MuJoCo. 0.
-    pub creep_share: f64,
-    /// Height of the test lift. As in trials.
-    pub test_lift_m: f64,
-    /// Amplitude of the shake after it; 0: none. As in trials.
-    pub test_shake_m: f64,
-    /// The engine's time step, seconds. As in trials; another one shows how far results depend on it.
-    pub step_secs: f64,
-    /// The engine's time step from the lift on, seconds. As before the lift; another one shows how far the outcome depends on it
-    /// from the same settled hand.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub lift_step_secs: Option<f64>,
-}
-
-impl Default for LiftOptions {
-    fn default() -> Self {
-        LiftOptions {
-            engine: PhysicsEngine::default(),
-            friction_factor: [1.0; 2],
-            mass_factor: [1.0; 2],
-            centre_shift_m: 0.0,
-            stand_radius_m: [PhysicsOptions::default().stand_radius_m; 2],
-            force_factor: [1.0; 2],
-            speed_factor: [1.0; 2],
-            rubber_factor: [1.0; 2],
-            contact_factor: [1.0; 2],
-            gear_factor: [1.0; 2],
-            creep_share: 0.0,
-            test_lift_m: TrialProtocol::default().test_lift_m,
-            test_shake_m: TrialProtocol::default().test_shake_m,
-            step_secs: PhysicsOptions::default().step_secs,
-            lift_step_secs: None,
-        }
+with_defaults! {
+    /// What differs from lift to lift, so that a model does not learn what a robot does not know.
+    pub struct LiftOptions {
+        /// The physics engine.
+        pub engine: PhysicsEngine = PhysicsEngine::default(),
+        /// Range of a factor on the friction, uniform. `[1, 1]`: none.
+        pub friction_factor: [f64; 2] = [1.0; 2],
+        /// Range of a factor on the object's mass, its logarithm uniform. `[1, 1]`: none.
+        pub mass_factor: [f64; 2] = [1.0; 2],
+        /// Largest distance by which the centre of mass is off the object's own, uniform over the ball: contents. 0: none.
+        pub centre_shift_m: f64 = 0.0,
+        /// Range of the radius of the table or post on which the object stands, its logarithm uniform. As in trials.
+        pub stand_radius_m: [f64; 2] = [PhysicsOptions::default().stand_radius_m; 2],
+        /// Range of a factor on the forces with which the fingers close and grip, its logarithm uniform. `[1, 1]`: none.
+        pub force_factor: [f64; 2] = [1.0; 2],
+        /// Range of a factor on the fingers' closing speed, its logarithm uniform. `[1, 1]`: none.
+        pub speed_factor: [f64; 2] = [1.0; 2],
+        /// Range of a factor on the stiffness of the rubber that spreads a force over cells, its logarithm uniform. `[1, 1]`: none.
+        pub rubber_factor: [f64; 2] = [1.0; 2],
+        /// Range of a factor on how fast contacts give way, its logarithm uniform: 0.5 is four times as soft. `[1, 1]`: none.
+        pub contact_factor: [f64; 2] = [1.0; 2],
+        /// Range of a factor on the stiffness of the gears between motors and joints, its logarithm uniform. `[1, 1]`: none.
+        pub gear_factor: [f64; 2] = [1.0; 2],
+        /// Share of the lifts in which contacts creep, with MuJoCo. 0.
+        pub creep_share: f64 = 0.0,
+        /// Height of the test lift. As in trials.
+        pub test_lift_m: f64 = TrialProtocol::default().test_lift_m,
+        /// Amplitude of the shake after it; 0: none. As in trials.
+        pub test_shake_m: f64 = TrialProtocol::default().test_shake_m,
+        /// The engine's time step, seconds. As in trials; another one shows how far results depend on it.
+        pub step_secs: f64 = PhysicsOptions::default().step_secs,
+        /// The engine's time step from the lift on, seconds. As before the lift; another one shows how far the outcome depends on it
+        /// from the same settled hand.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        pub lift_step_secs: Option<f64> = None,
     }
 }
 
@@ -260,24 +209,18 @@ impl LiftOptions {
     }
 }
 
-/// The frames of a grasp.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct FrameOptions {
-    /// Frames before the object touches, without force.
-    pub n_open: usize,
-    /// Frames that are evenly spaced over the closing. A contact's force rises linearly from the stop of its link to the
-    /// end of the closing.
-    pub n_closing: usize,
-    /// Frames after the last joint's stop, with full force and noise of their own.
-    pub n_settled: usize,
-    /// Time between frames. 10 ms: 100 Hz.
-    pub period_nanos: u64,
-}
-
-impl Default for FrameOptions {
-    fn default() -> Self {
-        FrameOptions { n_open: 2, n_closing: 6, n_settled: 6, period_nanos: 10_000_000 }
+with_defaults! {
+    /// The frames of a grasp.
+    pub struct FrameOptions {
+        /// Frames before the object touches, without force.
+        pub n_open: usize = 2,
+        /// Frames that are evenly spaced over the closing. A contact's force rises linearly from the stop of its link to the
+        /// end of the closing.
+        pub n_closing: usize = 6,
+        /// Frames after the last joint's stop, with full force and noise of their own.
+        pub n_settled: usize = 6,
+        /// Time between frames. 10 ms: 100 Hz.
+        pub period_nanos: u64 = 10_000_000,
     }
 }
 

@@ -9,32 +9,25 @@ use nalgebra::{Isometry3, Point3, Unit, UnitQuaternion, UnitVector3, Vector3};
 use parry3d_f64::math::{Rotation, Vector};
 use parry3d_f64::query::Ray;
 use rand::RngExt;
-use serde::{Deserialize, Serialize};
 
 use super::mechanism::Mechanism;
-use super::option_check::{OptionError, not_negative, positive, require, share};
+use super::option_check::{OptionError, not_negative, positive, require, share, with_defaults};
 use super::protocol::{Exploration, ProtocolOptions, Start, draw_start};
 use blindgrasp_objects::Object;
 use blindgrasp_stages::hand::{Hand, JointError, pose_from_isometry};
 
-/// How grasps are planned, where the protocol's approach is `planned`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct PlannerOptions {
-    /// The best of so many is kept. 16: about where the mean epsilon stops growing quickly.
-    pub n_approaches: usize,
-    /// The part of the approaches along a surface normal; the others go along a principal axis. 0.5.
-    pub normal_fraction: f64,
-    /// In every other approach the palm draws back from the touch by up to this, uniformly, before the fingers close: how
-    /// else would they close round something small. 50 mm.
-    pub stand_off_m: f64,
-    /// A pad this far from the object, or farther, counts as much as one whose normal is at a right angle to it. 10 mm.
-    pub distance_scale_m: f64,
-}
-
-impl Default for PlannerOptions {
-    fn default() -> Self {
-        PlannerOptions { n_approaches: 16, normal_fraction: 0.5, stand_off_m: 0.05, distance_scale_m: 0.01 }
+with_defaults! {
+    /// How grasps are planned, where the protocol's approach is `planned`.
+    pub struct PlannerOptions {
+        /// The best of so many is kept. 16: about where the mean epsilon stops growing quickly.
+        pub n_approaches: usize = 16,
+        /// The part of the approaches along a surface normal; the others go along a principal axis. 0.5.
+        pub normal_fraction: f64 = 0.5,
+        /// In every other approach the palm draws back from the touch by up to this, uniformly, before the fingers close: how
+        /// else would they close round something small. 50 mm.
+        pub stand_off_m: f64 = 0.05,
+        /// A pad this far from the object, or farther, counts as much as one whose normal is at a right angle to it. 10 mm.
+        pub distance_scale_m: f64 = 0.01,
     }
 }
 

@@ -21,7 +21,7 @@ use serde::{Deserialize, Serialize};
 
 use super::distance::{ClosestPoints, PlacedShape};
 use super::mechanism::{ClosestLinks, ClosingJoint, Mechanism};
-use super::option_check::{OptionError, not_negative, positive, require, share};
+use super::option_check::{OptionError, not_negative, positive, require, share, with_defaults};
 use blindgrasp_objects::Object;
 use blindgrasp_stages::hand::{Hand, JointError, pose_from_isometry};
 
@@ -36,39 +36,26 @@ pub enum Approach {
     Planned,
 }
 
-/// The options of the exploration.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct ProtocolOptions {
-    /// The approach of the palm.
-    pub approach: Approach,
-    /// A link this near to the object touches it. 0.2 mm: small against the pad's 3 mm, large against the 0.1 mm at
-    /// which links are stopped.
-    pub touch_tolerance_m: f64,
-    /// Links of the hand stop this far from each other. 0.1 mm: fingers close until they press on each other, as a real
-    /// hand's do, and cells between them feel it. Above the touch tolerance they stay apart.
-    pub clearance_m: f64,
-    /// Preshape joints without an open value in the layout are drawn uniformly from this part of their range. `[0, 0.5]`: the Barrett's spread from 0 to π/2,
-    /// fingers 1 and 2 opposite to finger 3 or at right angles to it.
-    pub preshape_range: [f64; 2],
-    /// The object's centre of mass is off the palm's axis by up to this, uniformly over the disc. 15 mm: the approach
-    /// is blind, aimed roughly.
-    pub lateral_offset_m: f64,
-    /// How far the palm draws back after the first touch of a blind approach, before the fingers close. 0, as the paper's
-    /// "until something touches" does not mention it. Planned approaches have a stand-off of their own.
-    pub back_off_m: f64,
-}
-
-impl Default for ProtocolOptions {
-    fn default() -> Self {
-        ProtocolOptions {
-            approach: Approach::Blind,
-            touch_tolerance_m: 0.0002,
-            clearance_m: 0.0001,
-            preshape_range: [0.0, 0.5],
-            lateral_offset_m: 0.015,
-            back_off_m: 0.0,
-        }
+with_defaults! {
+    /// The options of the exploration.
+    pub struct ProtocolOptions {
+        /// The approach of the palm.
+        pub approach: Approach = Approach::Blind,
+        /// A link this near to the object touches it. 0.2 mm: small against the pad's 3 mm, large against the 0.1 mm at
+        /// which links are stopped.
+        pub touch_tolerance_m: f64 = 0.0002,
+        /// Links of the hand stop this far from each other. 0.1 mm: fingers close until they press on each other, as a real
+        /// hand's do, and cells between them feel it. Above the touch tolerance they stay apart.
+        pub clearance_m: f64 = 0.0001,
+        /// Preshape joints without an open value in the layout are drawn uniformly from this part of their range. `[0, 0.5]`: the Barrett's spread from 0 to π/2,
+        /// fingers 1 and 2 opposite to finger 3 or at right angles to it.
+        pub preshape_range: [f64; 2] = [0.0, 0.5],
+        /// The object's centre of mass is off the palm's axis by up to this, uniformly over the disc. 15 mm: the approach
+        /// is blind, aimed roughly.
+        pub lateral_offset_m: f64 = 0.015,
+        /// How far the palm draws back after the first touch of a blind approach, before the fingers close. 0, as the paper's
+        /// "until something touches" does not mention it. Planned approaches have a stand-off of their own.
+        pub back_off_m: f64 = 0.0,
     }
 }
 

@@ -6,27 +6,20 @@
 
 use nalgebra::{Isometry3, Point3, UnitVector3};
 use rand::RngExt;
-use serde::{Deserialize, Serialize};
 
-use super::option_check::{OptionError, require, share};
+use super::option_check::{OptionError, require, share, with_defaults};
 use blindgrasp_stages::hand::Hand;
 
-/// How skins spread force. The hands that differ draw each their own.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct SkinOptions {
-    /// Share of the hands whose skin spreads force as a bell; the others have the rubber's patches. 0.
-    pub bell_share: f64,
-    /// Range of the bell's standard deviation at 1 N, metres, its logarithm uniform. 1 to 4 mm.
-    pub bell_m: [f64; 2],
-    /// Range of the share of the force between and beyond cells that the cells around feel all the same, uniform: 0 loses it, 1
-    /// keeps it. `[0, 1]`.
-    pub kept: [f64; 2],
-}
-
-impl Default for SkinOptions {
-    fn default() -> Self {
-        SkinOptions { bell_share: 0.0, bell_m: [0.001, 0.004], kept: [0.0, 1.0] }
+with_defaults! {
+    /// How skins spread force. The hands that differ draw each their own.
+    pub struct SkinOptions {
+        /// Share of the hands whose skin spreads force as a bell; the others have the rubber's patches. 0.
+        pub bell_share: f64 = 0.0,
+        /// Range of the bell's standard deviation at 1 N, metres, its logarithm uniform. 1 to 4 mm.
+        pub bell_m: [f64; 2] = [0.001, 0.004],
+        /// Range of the share of the force between and beyond cells that the cells around feel all the same, uniform: 0 loses it, 1
+        /// keeps it. `[0, 1]`.
+        pub kept: [f64; 2] = [0.0, 1.0],
     }
 }
 

@@ -17,38 +17,25 @@ use nalgebra::{Isometry3, Matrix2, Matrix3, Matrix3x2, Point3, SymmetricEigen, U
 use parry3d_f64::math::Vector;
 use parry3d_f64::query::Ray;
 use parry3d_f64::shape::Shape;
-use serde::{Deserialize, Serialize};
 
 use super::distance::{PlacedShape, Within};
 use super::mechanism::Mechanism;
-use super::option_check::{OptionError, positive, require};
+use super::option_check::{OptionError, positive, require, with_defaults};
 use blindgrasp_stages::hand::{Cell, Hand, Pad, pose_from_isometry};
 
-/// The rubber and the load.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct SoftFingerOptions {
-    /// Thickness of the mattress. 3 mm (Ciocarlie).
-    pub thickness_m: f64,
-    /// Young's modulus. 1.5e6 Pa (Ciocarlie; a public model file says 1500, a unit slip).
-    pub youngs_modulus_pa: f64,
-    /// Static load of a link, shared equally by its contacts. 5 N (Ciocarlie).
-    pub normal_force_newtons: f64,
-    /// Longest semi-axis of a patch on a link without a pad, in place of half the pad's width. 10 mm: half a Barrett finger.
-    pub bare_half_width_m: f64,
-    /// Relative radii above this count as this, so that a flat direction has a number. 1 m.
-    pub largest_radius_m: f64,
-}
-
-impl Default for SoftFingerOptions {
-    fn default() -> Self {
-        SoftFingerOptions {
-            thickness_m: 0.003,
-            youngs_modulus_pa: 1.5e6,
-            normal_force_newtons: 5.0,
-            bare_half_width_m: 0.010,
-            largest_radius_m: 1.0,
-        }
+with_defaults! {
+    /// The rubber and the load.
+    pub struct SoftFingerOptions {
+        /// Thickness of the mattress. 3 mm (Ciocarlie).
+        pub thickness_m: f64 = 0.003,
+        /// Young's modulus. 1.5e6 Pa (Ciocarlie; a public model file says 1500, a unit slip).
+        pub youngs_modulus_pa: f64 = 1.5e6,
+        /// Static load of a link, shared equally by its contacts. 5 N (Ciocarlie).
+        pub normal_force_newtons: f64 = 5.0,
+        /// Longest semi-axis of a patch on a link without a pad, in place of half the pad's width. 10 mm: half a Barrett finger.
+        pub bare_half_width_m: f64 = 0.010,
+        /// Relative radii above this count as this, so that a flat direction has a number. 1 m.
+        pub largest_radius_m: f64 = 1.0,
     }
 }
 

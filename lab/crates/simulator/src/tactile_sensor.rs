@@ -9,56 +9,56 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
-use super::option_check::{OptionError, not_negative, positive, require, share};
+use super::option_check::{OptionError, not_negative, positive, require, share, with_defaults};
 use super::skin::{Bell, SkinOptions};
 use blindgrasp_stages::hand::{Cell, Hand};
 
-/// The quality of the sensor.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct SensorOptions {
-    /// Standard deviation of each cell's additive Gaussian noise. 0.01 N: assumed, a fifth of the noise threshold.
-    pub noise_newtons: f64,
-    /// Standard deviation of the logarithm of the cells' gains: 0.1 is about 10 %. 0: all cells are calibrated.
-    pub gain_sigma: f64,
-    /// Standard deviation of the logarithm of the gain that all cells share. 0.
-    pub common_gain_sigma: f64,
-    /// Standard deviation of each cell's offset: its drift since the sensor was tared. 0.
-    pub offset_newtons: f64,
-    /// Share of the force on a cell that the cells around it feel in its place, in equal parts. 0.
-    pub crosstalk: f64,
-    /// How the skin spreads force over the cells, in lifts.
-    pub skin: SkinOptions,
-    /// Longest time constant with which cells follow a force, in lifts, uniform from 0 on: seconds. 0.
-    pub lag_secs: f64,
-    /// The part of the cells that always reads 0. 0.
-    pub dead_fraction: f64,
-    /// The part of the cells that always reads the largest count. 0.
-    pub stuck_fraction: f64,
-    /// The part of the readings that are spikes, and the standard deviation of a spike, half of a normal distribution. 0; 0.4 N.
-    pub spike_fraction: f64,
-    pub spike_newtons: f64,
-    /// Whether all grasps share gains, offsets, dead and stuck cells and the encoders' zeros, or each draws its own. All share
-    /// them.
-    pub faults_of: FaultsOf,
-    /// Counts per N/cm². 256 (the Barrett hand's tactile driver).
-    pub counts_per_newton_per_cm2: f64,
-    /// The largest count. 4095: 12 bits.
-    pub largest_count: u32,
-    /// Joint values are rounded to multiples of this, those of slides to multiples of 0.1 m for each radian. 2π/4096:
-    /// assumed, a 12-bit encoder; 0 rounds nothing.
-    pub encoder_quantum_rad: f64,
-    /// Standard deviation of the zero of each encoder. 0.
-    pub encoder_offset_rad: f64,
-    /// Share of the hands whose encoders are at the joints, in lifts; others have them at the motors, whose gears give. 0.
-    pub joint_encoders: f64,
-    /// Standard deviation of the noise of each force at the wrist. 0.1 N: assumed, of a sensor for 100 N and more.
-    pub wrist_noise_newtons: f64,
-    /// Standard deviation of the noise of each torque at the wrist, newton metres. 0.005: assumed, of the same sensor.
-    pub wrist_noise_torque: f64,
-    /// Standard deviation of the noise of each joint's torque, newton metres. 0.02: assumed, a fiftieth of the range of
-    /// the BH8-280's strain gauges.
-    pub joint_torque_noise: f64,
+with_defaults! {
+    /// The quality of the sensor.
+    pub struct SensorOptions {
+        /// Standard deviation of each cell's additive Gaussian noise. 0.01 N: assumed, a fifth of the noise threshold.
+        pub noise_newtons: f64 = 0.01,
+        /// Standard deviation of the logarithm of the cells' gains: 0.1 is about 10 %. 0: all cells are calibrated.
+        pub gain_sigma: f64 = 0.0,
+        /// Standard deviation of the logarithm of the gain that all cells share. 0.
+        pub common_gain_sigma: f64 = 0.0,
+        /// Standard deviation of each cell's offset: its drift since the sensor was tared. 0.
+        pub offset_newtons: f64 = 0.0,
+        /// Share of the force on a cell that the cells around it feel in its place, in equal parts. 0.
+        pub crosstalk: f64 = 0.0,
+        /// How the skin spreads force over the cells, in lifts.
+        pub skin: SkinOptions = SkinOptions::default(),
+        /// Longest time constant with which cells follow a force, in lifts, uniform from 0 on: seconds. 0.
+        pub lag_secs: f64 = 0.0,
+        /// The part of the cells that always reads 0. 0.
+        pub dead_fraction: f64 = 0.0,
+        /// The part of the cells that always reads the largest count. 0.
+        pub stuck_fraction: f64 = 0.0,
+        /// The part of the readings that are spikes, and the standard deviation of a spike, half of a normal distribution. 0; 0.4 N.
+        pub spike_fraction: f64 = 0.0,
+        pub spike_newtons: f64 = 0.4,
+        /// Whether all grasps share gains, offsets, dead and stuck cells and the encoders' zeros, or each draws its own. All share
+        /// them.
+        pub faults_of: FaultsOf = FaultsOf::Hand,
+        /// Counts per N/cm². 256 (the Barrett hand's tactile driver).
+        pub counts_per_newton_per_cm2: f64 = 256.0,
+        /// The largest count. 4095: 12 bits.
+        pub largest_count: u32 = 4095,
+        /// Joint values are rounded to multiples of this, those of slides to multiples of 0.1 m for each radian. 2π/4096:
+        /// assumed, a 12-bit encoder; 0 rounds nothing.
+        pub encoder_quantum_rad: f64 = std::f64::consts::TAU / 4096.0,
+        /// Standard deviation of the zero of each encoder. 0.
+        pub encoder_offset_rad: f64 = 0.0,
+        /// Share of the hands whose encoders are at the joints, in lifts; others have them at the motors, whose gears give. 0.
+        pub joint_encoders: f64 = 0.0,
+        /// Standard deviation of the noise of each force at the wrist. 0.1 N: assumed, of a sensor for 100 N and more.
+        pub wrist_noise_newtons: f64 = 0.1,
+        /// Standard deviation of the noise of each torque at the wrist, newton metres. 0.005: assumed, of the same sensor.
+        pub wrist_noise_torque: f64 = 0.005,
+        /// Standard deviation of the noise of each joint's torque, newton metres. 0.02: assumed, a fiftieth of the range of
+        /// the BH8-280's strain gauges.
+        pub joint_torque_noise: f64 = 0.02,
+    }
 }
 
 /// The grasps that share gains and other faults.
@@ -70,33 +70,6 @@ pub enum FaultsOf {
     Hand,
     /// Every grasp has its own, as if made by another hand of the same make.
     Grasp,
-}
-
-impl Default for SensorOptions {
-    fn default() -> Self {
-        SensorOptions {
-            noise_newtons: 0.01,
-            gain_sigma: 0.0,
-            common_gain_sigma: 0.0,
-            offset_newtons: 0.0,
-            crosstalk: 0.0,
-            skin: SkinOptions::default(),
-            lag_secs: 0.0,
-            dead_fraction: 0.0,
-            stuck_fraction: 0.0,
-            spike_fraction: 0.0,
-            spike_newtons: 0.4,
-            faults_of: FaultsOf::Hand,
-            counts_per_newton_per_cm2: 256.0,
-            largest_count: 4095,
-            encoder_quantum_rad: std::f64::consts::TAU / 4096.0,
-            encoder_offset_rad: 0.0,
-            joint_encoders: 0.0,
-            wrist_noise_newtons: 0.1,
-            wrist_noise_torque: 0.005,
-            joint_torque_noise: 0.02,
-        }
-    }
 }
 
 impl SensorOptions {

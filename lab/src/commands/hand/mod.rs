@@ -75,8 +75,13 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "JOINT,…", value_delimiter = ',')]
     preshape: Vec<String>,
     /// Noise threshold of the cells, newtons.
-    #[arg(long, default_value_t = 0.05, value_name = "NEWTONS")]
+    #[arg(long, default_value_t = 0.05, value_name = "NEWTONS", value_parser = threshold)]
     threshold: f64,
+}
+
+fn threshold(text: &str) -> Result<f64, String> {
+    let newtons: f64 = text.parse().map_err(|_| "expected a number".to_string())?;
+    if newtons >= 0.0 && newtons.is_finite() { Ok(newtons) } else { Err("expected 0 or more".into()) }
 }
 
 /// A pad of the layout to be written.

@@ -6,10 +6,12 @@ use std::path::Path;
 use serde::Serialize;
 
 use super::{ImportError, require_forces};
+use blindgrasp_grasps::dataset::TRUTH_METADATA;
 use blindgrasp_grasps::shown_hand::shown_hand;
-use blindgrasp_messages::{GraspTruth, Header, LiftOutcome, Phase, Record, Recorded, Stamped, TactileFrame};
+use blindgrasp_messages::{GraspTruth, Header, LiftOutcome, Record, Recorded, Stamped, TactileFrame};
 use blindgrasp_recording::{RecordingError, RecordingInfo, RecordingWriter};
 use blindgrasp_stages::hand::Hand;
+use blindgrasp_stages::label::Label;
 
 /// Number and epoch of a grasp.
 type GraspKey = (u64, u64);
@@ -25,12 +27,15 @@ pub struct FramesReport {
     pub n_dropped: usize,
     /// Different objects that the labels name.
     pub n_objects: usize,
+    /// Labels and outcomes that are left out, because no frame is of their grasps.
+    pub n_without_frames: usize,
     /// The senses that all frames have.
     pub senses: Vec<String>,
 }
 
 /// Writes frames, and the labels and outcomes of their grasps, to a recording at `out`. A label has its own header if it is
-/// given, else stamp and epoch of its grasp's first frame. `name` says where they are from. After an error there is no recording.
+/// given, else stamp and epoch of its grasp's first frame. `label` says what stable means in them, if that is known. `name` says
+/// where they are from. After an error there is no recording.
 ///
 /// # Errors
 /// A frame that does not fit the hand, frames of a grasp on both sides of another one, or a recording that cannot be written.
@@ -40,6 +45,7 @@ pub fn import_frames(
     frames: &[Stamped<TactileFrame>],
     truths: &BTreeMap<GraspKey, (Option<Header>, GraspTruth)>,
     lifts: &[Stamped<LiftOutcome>],
+    label: Option<Label>,
     out: &Path,
 ) -> Result<FramesReport, ImportError> {
     let refused = |message: String| ImportError::Table { path: name.into(), message };
@@ -66,15 +72,17 @@ pub fn import_frames(
                 "{place}: frames of another grasp come before it; expected each grasp's together"
             )));
         }
-        if matches!(phase, Phase::Kept | Phase::Dropped) {
-            outcomes.entry(key).or_insert(*phase == Phase::Kept);
+        if let Some(is_kept) = phase.outcome() {
+            *outcomes.entry(key).or_insert(true) &= is_kept;
         }
         let has = senses_of(&frame.message);
         senses = Some(senses.map_or(has.clone(), |known| &known & &has));
         recording.write_record(TactileFrame::TOPIC, &Record::Tactile(frame.clone()))?;
     }
-    outcomes.extend(write_known(&mut recording, hand, &seen, truths, lifts)?);
+    let (known, n_without_frames) = write_known(&mut recording, hand, &seen, (truths, label), lifts)?;
+    outcomes.extend(known);
     recording.finish()?;
+    let objects = truths.iter().filter(|(key, _)| seen.contains_key(key)).map(|(_, (_, truth))| &truth.object);
     let n_kept = outcomes.values().filter(|is_kept| **is_kept).count();
     Ok(FramesReport {
         hand: hand.name.clone(),
@@ -82,24 +90,34 @@ pub fn import_frames(
         n_frames: frames.len(),
         n_kept,
         n_dropped: outcomes.len() - n_kept,
-        n_objects: truths.values().map(|(_, truth)| &truth.object).collect::<BTreeSet<_>>().len(),
+        n_objects: objects.collect::<BTreeSet<_>>().len(),
+        n_without_frames,
         senses: senses.unwrap_or_default().into_iter().map(String::from).collect(),
     })
 }
 
-/// Writes the labels and the outcomes of grasps whose first frames have these headers. Returns which grasps hold.
+/// Writes the labels and the outcomes of grasps whose first frames have these headers. Returns which lifts held,
+/// and how many labels and outcomes are of none of them.
 fn write_known(
     recording: &mut RecordingWriter,
     hand: &Hand,
     seen: &BTreeMap<GraspKey, Header>,
-    truths: &BTreeMap<GraspKey, (Option<Header>, GraspTruth)>,
+    (truths, label): (&BTreeMap<GraspKey, (Option<Header>, GraspTruth)>, Option<Label>),
     lifts: &[Stamped<LiftOutcome>],
-) -> Result<BTreeMap<GraspKey, bool>, RecordingError> {
-    let mut outcomes = BTreeMap::new();
+) -> Result<(BTreeMap<GraspKey, bool>, usize), RecordingError> {
+    let (mut outcomes, mut n_without_frames) = (BTreeMap::new(), 0);
+    if let Some(label) = label {
+        recording.write_metadata(TRUTH_METADATA, BTreeMap::from([("label".into(), label.word().into())]))?;
+    }
     let mut seq = 0;
     for (key, (own, truth)) in truths {
-        let Some(first) = seen.get(key) else { continue };
-        outcomes.insert(*key, truth.stable);
+        let Some(first) = seen.get(key) else {
+            n_without_frames += 1;
+            continue;
+        };
+        if label != Some(Label::WrenchSpace) {
+            outcomes.insert(*key, truth.stable);
+        }
         let header = own.map_or(Header { seq, ..*first }, |own| Header { hand_id: hand.id(), ..own });
         seq += 1;
         recording.write(GraspTruth::TOPIC, &Stamped { header, message: truth.clone() })?;
@@ -107,6 +125,7 @@ fn write_known(
     for Stamped { header, message } in lifts {
         let key = (message.grasp_id, header.epoch);
         if !seen.contains_key(&key) {
+            n_without_frames += 1;
             continue;
         }
         if message.lifted {
@@ -115,7 +134,7 @@ fn write_known(
         let header = Header { hand_id: hand.id(), ..*header };
         recording.write(LiftOutcome::TOPIC, &Stamped { header, message: message.clone() })?;
     }
-    Ok(outcomes)
+    Ok((outcomes, n_without_frames))
 }
 
 /// Refuses a frame that is not of this hand, with the reason.

@@ -11,7 +11,7 @@ use std::path::PathBuf;
 use nalgebra::{DMatrix, DVector};
 
 use super::probes::reading_at;
-use super::{Example, Examples, LOOKS, N_FOLDS, TrainingError, folds_by_object, values_at};
+use super::{Example, Examples, LOOKS, N_FOLDS, TrainingError, counts, folds_by_object, values_at};
 use crate::learners::decision_values;
 use crate::learners::training_range::learn_training_range;
 use crate::promise::{ObjectTrials, promise};
@@ -103,9 +103,10 @@ fn adapt_to_lifts(hand: &Hand, model: &Model, read: &Examples, robots: &[String]
     if lifts.len() < FEWEST_OUTCOMES {
         return refused(format!(
             "{} lifts with an outcome that the model can judge when the hand is {}: expected {FEWEST_OUTCOMES} or more (left \
-             out: {taught_nothing:?})",
+             out: {})",
             lifts.len(),
             look.as_str(),
+            counts(&taught_nothing),
         ));
     }
     let examples: Vec<&Example> = lifts.iter().map(|lift| lift.example).collect();
@@ -180,7 +181,12 @@ fn judged_lifts<'a>(
         } else if let Some(log_odds) = log_odds(model, look, example) {
             lifts.push(JudgedLift { example, log_odds });
         } else {
-            *others.entry(format!("no contact when {}, or no such frame", look.as_str())).or_default() += 1;
+            let what = if reading_at(look, example).is_none() {
+                "frame with contact"
+            } else {
+                "earlier frames that the model needs"
+            };
+            *others.entry(format!("no {what} when {}", look.as_str())).or_default() += 1;
         }
     }
     (lifts, others)

@@ -394,6 +394,12 @@ fn readings<'a>(examples: &[&'a Example]) -> Vec<FeltReading<'a>> {
     examples.iter().map(|example| example.reading()).collect()
 }
 
+/// Numbers of grasps by their reason, for people.
+pub fn counts(by_reason: &BTreeMap<String, usize>) -> String {
+    let counts: Vec<String> = by_reason.iter().map(|(reason, n)| format!("{n} {reason}")).collect();
+    if counts.is_empty() { "none".into() } else { counts.join(", ") }
+}
+
 /// Refuses examples without grasps or of one class only.
 fn check_examples(read: &Examples, recordings: &[PathBuf]) -> Result<(), TrainingError> {
     let (n, n_excluded) = (read.examples.len(), &read.n_excluded);
@@ -401,13 +407,15 @@ fn check_examples(read: &Examples, recordings: &[PathBuf]) -> Result<(), Trainin
     if n == 0 {
         let names: Vec<_> = recordings.iter().map(|path| file_name(path)).collect();
         return Err(TrainingError::Data(format!(
-            "no grasp to train on in {}: expected settled frames with contact, and truth (left out: {n_excluded:?})",
-            if names.is_empty() { "memory".into() } else { names.join(", ") }
+            "no grasp to train on in {}: expected settled frames with contact, and truth (left out: {})",
+            if names.is_empty() { "memory".into() } else { names.join(", ") },
+            counts(n_excluded)
         )));
     }
     if n_stable == 0 || n_stable == n {
         return Err(TrainingError::Data(format!(
-            "{n_stable} of {n} grasps with contact are stable: expected some of each (left out: {n_excluded:?})"
+            "{n_stable} of {n} grasps with contact are stable: expected some of each (left out: {})",
+            counts(n_excluded)
         )));
     }
     Ok(())

@@ -57,6 +57,7 @@ impl Axle {
 
 /// A joint with its motor. Its travel is measured from the open joint on, and grows as it closes: radians, or metres of a
 /// slide.
+#[derive(Default)]
 struct Drive {
     /// Index into [`Hand::joints`].
     joint_idx: usize,
@@ -98,20 +99,11 @@ impl Drive {
         Drive {
             joint_idx,
             axles: vec![axle],
-            follows: None,
             rate: rate.abs(),
             open,
             sign,
             range: if sign < 0.0 { open - spec.lower } else { spec.upper - open }.max(0.0),
-            lever: 0.0,
-            limit: 0.0,
-            target: 0.0,
-            target_speed: 0.0,
-            stiffness: 0.0,
-            is_stopped: false,
-            has_broken_away: false,
-            lagging_secs: 0.0,
-            grip_newtons: 0.0,
+            ..Drive::default()
         }
     }
 

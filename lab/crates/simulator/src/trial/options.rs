@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use super::TrialError;
 use crate::OptionError;
 use crate::contact_points::ContactOptions;
-use crate::option_check::{not_negative, positive, require};
+use crate::option_check::{not_negative, positive, require, with_defaults};
 use crate::planner::PlannerOptions;
 use crate::protocol::{Approach, check_preshape_range};
 use crate::soft_finger::SoftFingerOptions;
@@ -30,146 +30,113 @@ pub struct TrialOptions {
     pub sensor: SensorOptions,
 }
 
-/// The hand's path and the length of each phase, in simulated time.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct TrialProtocol {
-    /// The approach of the palm. Blind, as the paper's robot. `planned` is for hands that need to know the object's place,
-    /// such as a gripper: the best of the planner's approaches from above.
-    pub approach: Approach,
-    /// Part of their range from which preshape joints are drawn uniformly. `[0, 0.5]`, as in the training data.
-    pub preshape_range: [f64; 2],
-    /// Largest distance of the target's centre of mass from the palm's axis, uniform over the disc. 15 mm, as in the
-    /// training data.
-    pub lateral_offset_m: f64,
-    /// Least descent of the approach, from level; directions are uniform over the rest of the sphere. 0: level approaches
-    /// are tried as well, where the stand lets them. Attempts straight down have 1.4 rad at least.
-    pub least_descent_rad: f64,
-    /// Approaches of which one is chosen where a model says which are kept more often, 1 to 8. 8.
-    pub n_approaches: u32,
-    /// Least distance of the open hand from the stand; a nearer approach is drawn again. An attempt straight down keeps it
-    /// while the hand closes. 5 mm.
-    pub stand_clearance_m: f64,
-    /// Time between frames. 10 ms: 100 Hz.
-    pub frame_nanos: u64,
-    /// Time between frames while the arm lifts. 50 ms: 20 Hz.
-    pub lifting_frame_nanos: u64,
-    /// Distance of the hand's first place from the first touch. 3 mm.
-    pub stand_off_m: f64,
-    /// Speed of the approach, metres per second. 0.03: a guarded move.
-    pub approach_speed: f64,
-    /// Force at which the arm stops. 0.1 N: twice a cell's noise threshold.
-    pub touch_newtons: f64,
-    /// Time from the last joint's stop to the first settled frame.
-    pub settle_secs: f64,
-    /// Number of settled frames.
-    pub n_settled: usize,
-    /// Time in which the hand tightens to its full force before the arm lifts. 0.3 s.
-    pub grip_secs: f64,
-    /// Height of the test lift. 10 mm: with 5 mm, a model of 1,500 lifts told kept from dropped objects less well (benches/archive.md).
-    pub test_lift_m: f64,
-    /// Duration of the test lift, and of setting down. 0.25 s.
-    pub test_lift_secs: f64,
-    /// Amplitude of a sideways shake after the test lift, one period of `test_shake_secs`. 4 mm; 0: none.
-    pub test_shake_m: f64,
-    /// Duration of that shake. 0.25 s.
-    pub test_shake_secs: f64,
-    /// Time from the end of the test lift to the first frame that decides. 0.15 s.
-    pub test_rest_secs: f64,
-    /// Height of the lift. 0.2 m.
-    pub lift_m: f64,
-    /// Duration of the lift; the speed rises and falls smoothly. 1 s.
-    pub lift_secs: f64,
-    /// Time for which the arm keeps still after the lift. 1 s.
-    pub hold_secs: f64,
-    /// Amplitude of the shakes, first sideways, then up and down. 10 mm.
-    pub shake_m: f64,
-    /// Frequency of the shakes. 2 Hz.
-    pub shake_hertz: f64,
-    /// Duration of each of the two shakes. 1 s.
-    pub shake_secs: f64,
-    /// A target that has moved this far in the hand is dropped. 50 mm.
-    pub lost_m: f64,
-}
-
-impl Default for TrialProtocol {
-    fn default() -> Self {
-        TrialProtocol {
-            approach: Approach::Blind,
-            preshape_range: [0.0, 0.5],
-            lateral_offset_m: 0.015,
-            least_descent_rad: 0.0,
-            n_approaches: 8,
-            stand_clearance_m: 0.005,
-            frame_nanos: 10_000_000,
-            lifting_frame_nanos: 50_000_000,
-            stand_off_m: 0.003,
-            approach_speed: 0.03,
-            touch_newtons: 0.1,
-            settle_secs: 0.2,
-            n_settled: 6,
-            grip_secs: 0.3,
-            test_lift_m: 0.01,
-            test_lift_secs: 0.25,
-            test_shake_m: 0.004,
-            test_shake_secs: 0.25,
-            test_rest_secs: 0.15,
-            lift_m: 0.2,
-            lift_secs: 1.0,
-            hold_secs: 1.0,
-            shake_m: 0.01,
-            shake_hertz: 2.0,
-            shake_secs: 1.0,
-            lost_m: 0.05,
-        }
+with_defaults! {
+    /// The hand's path and the length of each phase, in simulated time.
+    pub struct TrialProtocol {
+        /// The approach of the palm. Blind, as the paper's robot. `planned` is for hands that need to know the object's place,
+        /// such as a gripper: the best of the planner's approaches from above.
+        pub approach: Approach = Approach::Blind,
+        /// Part of their range from which preshape joints are drawn uniformly. `[0, 0.5]`, as in the training data.
+        pub preshape_range: [f64; 2] = [0.0, 0.5],
+        /// Largest distance of the target's centre of mass from the palm's axis, uniform over the disc. 15 mm, as in the
+        /// training data.
+        pub lateral_offset_m: f64 = 0.015,
+        /// Least descent of the approach, from level; directions are uniform over the rest of the sphere. 0: level approaches
+        /// are tried as well, where the stand lets them. Attempts straight down have 1.4 rad at least.
+        pub least_descent_rad: f64 = 0.0,
+        /// Approaches of which one is chosen where a model says which are kept more often, 1 to 8. 8.
+        pub n_approaches: u32 = 8,
+        /// Least distance of the open hand from the stand; a nearer approach is drawn again. An attempt straight down keeps it
+        /// while the hand closes. 5 mm.
+        pub stand_clearance_m: f64 = 0.005,
+        /// Time between frames. 10 ms: 100 Hz.
+        pub frame_nanos: u64 = 10_000_000,
+        /// Time between frames while the arm lifts. 50 ms: 20 Hz.
+        pub lifting_frame_nanos: u64 = 50_000_000,
+        /// Distance of the hand's first place from the first touch. 3 mm.
+        pub stand_off_m: f64 = 0.003,
+        /// Speed of the approach, metres per second. 0.03: a guarded move.
+        pub approach_speed: f64 = 0.03,
+        /// Force at which the arm stops. 0.1 N: twice a cell's noise threshold.
+        pub touch_newtons: f64 = 0.1,
+        /// Time from the last joint's stop to the first settled frame.
+        pub settle_secs: f64 = 0.2,
+        /// Number of settled frames.
+        pub n_settled: usize = 6,
+        /// Time in which the hand tightens to its full force before the arm lifts. 0.3 s.
+        pub grip_secs: f64 = 0.3,
+        /// Height of the test lift. 10 mm: with 5 mm, a model of 1,500 lifts told kept from dropped objects less well (benches/archive.md).
+        pub test_lift_m: f64 = 0.01,
+        /// Duration of the test lift, and of setting down. 0.25 s.
+        pub test_lift_secs: f64 = 0.25,
+        /// Amplitude of a sideways shake after the test lift, one period of `test_shake_secs`. 4 mm; 0: none.
+        pub test_shake_m: f64 = 0.004,
+        /// Duration of that shake. 0.25 s.
+        pub test_shake_secs: f64 = 0.25,
+        /// Time from the end of the test lift to the first frame that decides. 0.15 s.
+        pub test_rest_secs: f64 = 0.15,
+        /// Height of the lift. 0.2 m.
+        pub lift_m: f64 = 0.2,
+        /// Duration of the lift; the speed rises and falls smoothly. 1 s.
+        pub lift_secs: f64 = 1.0,
+        /// Time for which the arm keeps still after the lift. 1 s.
+        pub hold_secs: f64 = 1.0,
+        /// Amplitude of the shakes, first sideways, then up and down. 10 mm.
+        pub shake_m: f64 = 0.01,
+        /// Frequency of the shakes. 2 Hz.
+        pub shake_hertz: f64 = 2.0,
+        /// Duration of each of the two shakes. 1 s.
+        pub shake_secs: f64 = 1.0,
+        /// A target that has moved this far in the hand is dropped. 50 mm.
+        pub lost_m: f64 = 0.05,
     }
 }
 
-/// Hand, stand and engine.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct PhysicsOptions {
-    /// The engine that moves the bodies.
-    pub engine: PhysicsEngine,
-    /// The engine's time step. 5 ms. Of MuJoCo it is the time between two commands of the motors.
-    pub step_secs: f64,
-    /// Small steps of the solver in a time step. 10: of 0.5 ms.
-    pub n_solver_iterations: usize,
-    /// Natural frequency of contacts, which give way like a damped spring: the rubber. 100 Hz.
-    pub contact_hertz: f64,
-    /// Damping of contacts, as a share of critical damping. 1.
-    pub contact_damping_ratio: f64,
-    /// Radius of the round table on which the target stands. 0.4 m. With 0.04 it is a post, under whose edge fingers find
-    /// room.
-    pub stand_radius_m: f64,
-    /// The table's height over the ground. 0.3 m: the fingers do not come to the ground beside a post.
-    pub stand_height_m: f64,
-    /// Coulomb friction between the target and the table, at most 1. 0.5, assumed: wood.
-    pub stand_friction: f64,
-    /// Force of a finger at its tip while it closes, and after its stop. 5 N: the static load of the training data.
-    pub grip_newtons: f64,
-    /// Force of a finger at its tip for the lift, if what it holds does not give. 15 N: the BH8-280's active finger force.
-    pub lift_grip_newtons: f64,
-    /// Force at the tip against which a stopped joint's gear holds. 20 N: the BH8-280's passive finger force.
-    pub hold_newtons: f64,
-    /// Speed of a closing leader, radians per second. 1.0, assumed: careful.
-    pub closing_rad_per_sec: f64,
-    /// Time after which a joint that lags at its limit is blocked. 30 ms.
-    pub blocked_secs: f64,
-    /// Stiffness of the gear between motor, where the encoder is, and joint, newton metres per radian. 100, assumed.
-    pub gear_stiffness: f64,
-    /// Damping of the gear, newton metre seconds per radian. 0.5, assumed.
-    pub gear_damping: f64,
-    /// Inertia of the motor as the joint feels it, kg·m². 0.002, assumed.
-    pub rotor_inertia: f64,
-    /// Density of the links. 2700 kg/m³: aluminium.
-    pub link_density_kg_per_m3: f64,
-    /// Options of the contact points, as in the training data.
-    pub contacts: ContactOptions,
-    /// Options of the rubber, for the cells, as in the training data. Its load is not used: forces are the engine's.
-    pub soft_finger: SoftFingerOptions,
-    /// Options of MuJoCo.
-    pub mujoco: MujocoOptions,
+with_defaults! {
+    /// Hand, stand and engine.
+    pub struct PhysicsOptions {
+        /// The engine that moves the bodies.
+        pub engine: PhysicsEngine = PhysicsEngine::Rapier,
+        /// The engine's time step. 5 ms. Of MuJoCo it is the time between two commands of the motors.
+        pub step_secs: f64 = 0.005,
+        /// Small steps of the solver in a time step. 10: of 0.5 ms.
+        pub n_solver_iterations: usize = 10,
+        /// Natural frequency of contacts, which give way like a damped spring: the rubber. 100 Hz.
+        pub contact_hertz: f64 = 100.0,
+        /// Damping of contacts, as a share of critical damping. 1.
+        pub contact_damping_ratio: f64 = 1.0,
+        /// Radius of the round table on which the target stands. 0.4 m. With 0.04 it is a post, under whose edge fingers find
+        /// room.
+        pub stand_radius_m: f64 = 0.4,
+        /// The table's height over the ground. 0.3 m: the fingers do not come to the ground beside a post.
+        pub stand_height_m: f64 = 0.3,
+        /// Coulomb friction between the target and the table, at most 1. 0.5, assumed: wood.
+        pub stand_friction: f64 = 0.5,
+        /// Force of a finger at its tip while it closes, and after its stop. 5 N: the static load of the training data.
+        pub grip_newtons: f64 = 5.0,
+        /// Force of a finger at its tip for the lift, if what it holds does not give. 15 N: the BH8-280's active finger force.
+        pub lift_grip_newtons: f64 = 15.0,
+        /// Force at the tip against which a stopped joint's gear holds. 20 N: the BH8-280's passive finger force.
+        pub hold_newtons: f64 = 20.0,
+        /// Speed of a closing leader, radians per second. 1.0, assumed: careful.
+        pub closing_rad_per_sec: f64 = 1.0,
+        /// Time after which a joint that lags at its limit is blocked. 30 ms.
+        pub blocked_secs: f64 = 0.03,
+        /// Stiffness of the gear between motor, where the encoder is, and joint, newton metres per radian. 100, assumed.
+        pub gear_stiffness: f64 = 100.0,
+        /// Damping of the gear, newton metre seconds per radian. 0.5, assumed.
+        pub gear_damping: f64 = 0.5,
+        /// Inertia of the motor as the joint feels it, kg·m². 0.002, assumed.
+        pub rotor_inertia: f64 = 0.002,
+        /// Density of the links. 2700 kg/m³: aluminium.
+        pub link_density_kg_per_m3: f64 = 2700.0,
+        /// Options of the contact points, as in the training data.
+        pub contacts: ContactOptions = ContactOptions::default(),
+        /// Options of the rubber, for the cells, as in the training data. Its load is not used: forces are the engine's.
+        pub soft_finger: SoftFingerOptions = SoftFingerOptions::default(),
+        /// Options of MuJoCo.
+        pub mujoco: MujocoOptions = MujocoOptions::default(),
+    }
 }
 
 /// A physics engine.
@@ -183,52 +150,19 @@ pub enum PhysicsEngine {
     Mujoco,
 }
 
-/// MuJoCo's contacts.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct MujocoOptions {
-    /// Its longest time step. 2 ms: three steps fill the 5 ms between two commands.
-    pub step_secs: f64,
-    /// How much harder contacts resist slipping than pressing. 10.
-    pub impratio: f64,
-    /// Iterations that keep what friction holds from creeping. 10; 0: contacts creep, as the engine's usually do.
-    pub noslip_iterations: usize,
-    /// Time constant of contacts, which give way like rubber: solref. 6 ms.
-    pub contact_secs: f64,
-    /// The torque about the normal that a contact resists, per friction force. 5 mm: of a patch of about 10 mm.
-    pub torsion_m: f64,
-}
-
-impl Default for MujocoOptions {
-    fn default() -> Self {
-        MujocoOptions { step_secs: 0.002, impratio: 10.0, noslip_iterations: 10, contact_secs: 0.006, torsion_m: 0.005 }
-    }
-}
-
-impl Default for PhysicsOptions {
-    fn default() -> Self {
-        PhysicsOptions {
-            engine: PhysicsEngine::Rapier,
-            step_secs: 0.005,
-            n_solver_iterations: 10,
-            contact_hertz: 100.0,
-            contact_damping_ratio: 1.0,
-            stand_radius_m: 0.4,
-            stand_height_m: 0.3,
-            stand_friction: 0.5,
-            grip_newtons: 5.0,
-            lift_grip_newtons: 15.0,
-            hold_newtons: 20.0,
-            closing_rad_per_sec: 1.0,
-            blocked_secs: 0.03,
-            gear_stiffness: 100.0,
-            gear_damping: 0.5,
-            rotor_inertia: 0.002,
-            link_density_kg_per_m3: 2700.0,
-            contacts: ContactOptions::default(),
-            soft_finger: SoftFingerOptions::default(),
-            mujoco: MujocoOptions::default(),
-        }
+with_defaults! {
+    /// MuJoCo's contacts.
+    pub struct MujocoOptions {
+        /// Its longest time step. 2 ms: three steps fill the 5 ms between two commands.
+        pub step_secs: f64 = 0.002,
+        /// How much harder contacts resist slipping than pressing. 10.
+        pub impratio: f64 = 10.0,
+        /// Iterations that keep what friction holds from creeping. 10; 0: contacts creep, as the engine's usually do.
+        pub noslip_iterations: usize = 10,
+        /// Time constant of contacts, which give way like rubber: solref. 6 ms.
+        pub contact_secs: f64 = 0.006,
+        /// The torque about the normal that a contact resists, per friction force. 5 mm: of a patch of about 10 mm.
+        pub torsion_m: f64 = 0.005,
     }
 }
 
