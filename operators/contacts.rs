@@ -199,7 +199,7 @@ impl Stage for FindContacts {
         let (mut summary, parts) = find_contacts(&self.hand, &mut self.memory, head, items, answers.items());
         // A hand that closes may have no contact yet.
         let is_at_rest = Phase::from_code(head.phase).is_ok_and(Phase::decides);
-        if is_at_rest {
+        if is_at_rest || summary.fault == Fault::SensorFault {
             let found = self.memory.odd_readings(&self.hand, head.grasp_id);
             self.odd.lines(head.grasp_id, &found, now_nanos).iter().for_each(|line| print_diagnostic(line));
         }

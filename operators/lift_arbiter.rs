@@ -141,7 +141,7 @@ struct Arbiter {
     /// Whether it has said that its threshold is below the model's.
     has_said_loosened: bool,
     /// The grasp of which it has said that its number was used again.
-    reused: Option<u64>,
+    reused: Option<(u64, u64)>,
     /// Whether it has said that contacts creep.
     has_said_creep: bool,
 }
@@ -170,8 +170,9 @@ impl Stage for Arbiter {
                 // The clock of a frame from the future cannot be trusted: the frame counts as infinitely old.
                 let age_nanos = now_nanos.checked_sub(head.header.origin_nanos).unwrap_or(u64::MAX);
                 self.arbiter.on_prediction(&head.header, &prediction, age_nanos, &mut self.decided);
-                if self.reused != Some(head.grasp_id) && self.arbiter.is_reused(head.grasp_id) {
-                    self.reused = Some(head.grasp_id);
+                let grasp = (head.header.epoch, head.grasp_id);
+                if self.reused != Some(grasp) && self.arbiter.is_reused(grasp) {
+                    self.reused = Some(grasp);
                     tracing::warn!(
                         "grasp {} is decided, but its hand has opened and settled again: no decision follows; expected another \
                          grasp_id for each grasp",

@@ -42,7 +42,7 @@ OF_GRASP = {
     "recording": "string", "hand": "string", "hand_id": "string", "model": "string", "day": "int64", "epoch": "uint64",
     "grasp_id": "uint64", "stable": "bool", "label": "string", "object": "string", "object_class": "string", "epsilon": "float64",
     "volume": "float64", "action": "string", "reason": "string", "probability_stable": "float64",
-    **{f"outcome_{name}": kind for name, kind in OUTCOME.items()},
+    **(OUTCOMES := {f"outcome_{name}": kind for name, kind in OUTCOME.items()}),
 }  # fmt: skip
 # Those without which a grasp cannot be read back.
 NEEDED = ("hand_id", "epoch", "grasp_id", "stable")
@@ -64,7 +64,7 @@ def to_parquet(
     graph predicted of the frame); then `joint_0`, …, `cell_0`, … (with `hand`, as in `Recording.to_frame`,
     `cell_palm_0`) and the other senses. Unknown values are missing. `from_parquet` reads it back.
 
-    Raises ModuleNotFoundError without pyarrow, and ValueError if the recordings are of different hands.
+    Raises ModuleNotFoundError without pyarrow, and ValueError if the recordings are of different hands or one is given twice.
     """
     pa = _pyarrow()
     data = _DataSet(recordings, hand)
@@ -133,8 +133,8 @@ def from_parquet(
     Columns that `to_parquet` does not write are not read. `hand` is the layout of a hand that is not built in. It warns of
     frames that are not in order. After an error there is no new recording.
 
-    Raises ModuleNotFoundError without pyarrow, FileExistsError, ValueError if the source is not written so, is not whole, or
-    has values that cannot be, and ProgramError if the hand is another one.
+    Raises ModuleNotFoundError without pyarrow, FileExistsError if a recording exists, ValueError if the source is not written
+    so, is not whole, or has values that cannot be, and ProgramError if the hand is another one.
     """
     pa = _pyarrow()
     path, folder = Path(fspath(source)), Path(fspath(out))
@@ -155,13 +155,14 @@ def _write_recordings(
     """Writes the recordings of the rows to the folder, all or none, and returns their names."""
     folder.mkdir(parents=True, exist_ok=True)
     names: list[str] = []
-    with tempfile.TemporaryDirectory(prefix=".blindgrasp-", dir=folder) as unfinished:
+    with tempfile.TemporaryDirectory() as lines_in, tempfile.TemporaryDirectory(prefix=".blindgrasp-", dir=folder) as unfinished:
         for name, of_recording in itertools.groupby(rows, lambda row: row["recording"]):
             if not isinstance(name, str) or not name or Path(name).is_absolute() or ".." in Path(name).parts or name in names:
                 raise ValueError(f"{path}: expected the names of different files in the column recording, found {name!r}")
             if (folder / name).exists() and not overwrite:
                 raise FileExistsError(f"{folder / name}: the file exists: name another folder, or say overwrite=True")
-            lines, to = Path(unfinished) / "lines.jsonl", Path(unfinished) / name
+            # The recording says that it was made of a file of this name.
+            lines, to = Path(lines_in) / Path(name).name, Path(unfinished) / name
             to.parent.mkdir(parents=True, exist_ok=True)
             with lines.open("w", encoding="utf-8") as stream:
                 layout = _write_lines(path, of_recording, stream)
@@ -190,6 +191,8 @@ def _rows_of_file(pa: Any, path: Path, hand: str | PathLike[str] | None) -> Iter
                     try:
                         names = cell_names(row["hand"] if hand is None else fspath(hand))
                     except (ProgramError, TypeError) as error:
+                        if hand is not None:
+                            raise
                         raise ValueError(f"{path}: its cells have names: give the layout of its hand {row['hand']!r} (hand=)") from error
                     columns["cell"] = [f"cell_{name}" for name in names]
                     _check(path, set(columns["cell"]), found)
@@ -205,7 +208,10 @@ def _rows_of_dataset(pa: Any, root: Path) -> Iterator[dict[str, Any]]:
         episodes |= {row["episode_index"]: row for row in table.to_pylist()}
     files = sorted(root.glob("data/*/*.parquet"))
     n_frames, n_expected = (sum(pa.parquet.read_metadata(path).num_rows for path in files), sum(row["length"] for row in episodes.values()))
-    n_episodes = json.loads((root / "meta/info.json").read_text(encoding="utf-8"))["total_episodes"]
+    try:
+        n_episodes = json.loads((root / "meta/info.json").read_text(encoding="utf-8"))["total_episodes"]
+    except (OSError, KeyError, ValueError) as error:
+        raise ValueError(f"{root}: expected a dataset with meta/info.json, found {error!r}") from error
     if (n_frames, len(episodes)) != (n_expected, n_episodes):
         raise ValueError(
             f"{root}: expected {n_episodes} episodes with {n_expected} frames, found {len(episodes)} with {n_frames}: is a file of "
@@ -252,12 +258,14 @@ def _write_lines(path: Path, rows: Iterator[dict[str, Any]], stream: Any) -> str
             label |= {name: first[name] or "" for name in ("object", "object_class")}
             write("/truth", n_labels, first, label, **({"label": first["label"]} if first.get("label") else {}))
             n_labels += 1
+        is_in_order = True
         for next_row in itertools.chain([first], (_checked(place, row) for row in of_grasp)):
-            for name in (*NEEDED, "day", "outcome_lifted", "outcome_held"):
+            for name in (*NEEDED, "hand", "day", "label", "object", "object_class", "epsilon", "volume", *OUTCOMES):
                 if next_row.get(name) != first.get(name):
                     raise ValueError(f"{place}: {name} changes from {first.get(name)!r} to {next_row.get(name)!r} within the grasp")
-            if next_row["seq"] < row["seq"]:
-                warnings.warn(f"{place}: frame {next_row['seq']} comes after frame {row['seq']}", stacklevel=3)
+            if is_in_order and next_row["seq"] < row["seq"]:
+                is_in_order = False
+                warnings.warn(f"{place}: frame {next_row['seq']} comes after frame {row['seq']}", stacklevel=4)
             row = next_row
             frame = {"joints": row["senses"].pop("joint"), "cells_newtons": row["senses"].pop("cell"), "phase": row["phase"]}
             # A grasp that lacks a sense has no number of it.
@@ -285,7 +293,7 @@ def _checked(place: str, row: dict[str, Any]) -> dict[str, Any]:
             return found
         if kind == "bool" and found in (True, False):
             return bool(found)
-        if kind in ("uint64", "int64") and isinstance(found, (int, float)) and found == int(found):
+        if kind == "uint64" and isinstance(found, (int, float)) and 0 <= found < 2**64 and found == int(found):
             return int(found)
         expected = {"bool": "true, false or nothing", "string": "text", "float64": "a number"}.get(kind, "a whole number")
         raise ValueError(f"{place}: the column {name} has {found!r}, expected {expected}")
@@ -301,8 +309,11 @@ def _checked(place: str, row: dict[str, Any]) -> dict[str, Any]:
     known |= {name: value(name, "float64", None) for name in ("epsilon", "volume")}
     known |= {"stable": value("stable", "bool", None), "day": value("day", "uint64", 0)}
     lifted = value("outcome_lifted", "bool", None)
+    known |= dict.fromkeys(OUTCOMES)
     if lifted is not None:
         known |= {f"outcome_{name}": value(f"outcome_{name}", kind, MISSING_OF[kind]) for name, kind in OUTCOME.items()}
+        if lifted and value("outcome_held", "bool", None) is None:
+            raise ValueError(f"{place}: the column outcome_held lacks a value, and outcome_lifted is true")
     return row | known | {"outcome_lifted": lifted}
 
 
@@ -371,8 +382,8 @@ class _DataSet:
             path = Path(fspath(source))
             found += map(Recording, sorted(path.glob("*.mcap")) if path.is_dir() else [path])
         # Files of one name, as parts of several folders, have the names of their folders before it.
-        paths = [recording.path.absolute() for recording in found]
-        names = [path.name for path in paths]
+        paths = [recording.path.resolve() for recording in found]
+        names = [recording.path.name for recording in found]
         if len(set(names)) < len(names) and len(set(paths)) == len(paths):
             above = os.path.commonpath([path.parent for path in paths])
             names = [path.relative_to(above).as_posix() for path in paths]

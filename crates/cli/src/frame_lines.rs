@@ -105,7 +105,7 @@ impl FrameLines {
             }
             Line::Truth(Stamped { header, message }, label) => {
                 if self.label != label && self.truths.values().any(|(own, _)| own.is_some()) {
-                    bail!("this label is by another rule than those before: give them one by one");
+                    bail!("this label is by another rule than those before: import the recordings one by one");
                 }
                 self.label = label;
                 ((message.grasp_id, header.epoch), (Some(header), message))

@@ -161,9 +161,9 @@ impl RecordingsSummary {
         let reader = RecordingReader::open(path)?;
         self.labels.extend(label_of(path, &reader)?);
         let mut last: Option<TactileFrame> = None;
-        // The outcomes of lifts that frames report, for grasps without a label.
+        // The outcomes of lifts that frames report, for grasps without a label; and the labels, of which a drop is the last.
         let mut reported = BTreeMap::new();
-        let mut labelled = BTreeSet::new();
+        let mut labels: BTreeMap<u64, GraspTruth> = BTreeMap::new();
         let mut seen = BTreeSet::new();
         let mut problems = Problems::default();
         let mut stamps_nanos: Option<(u64, u64)> = None;
@@ -192,8 +192,7 @@ impl RecordingsSummary {
                     }
                 }
                 Record::Truth(truth) => {
-                    labelled.insert(truth.message.grasp_id);
-                    self.count_truth(&truth.message, &mut sums.qualities);
+                    labels.insert(truth.message.grasp_id, truth.message);
                 }
                 _ => {}
             }
@@ -201,9 +200,10 @@ impl RecordingsSummary {
         self.count_contacts(hand, last);
         let (begin, end) = stamps_nanos.unwrap_or_default();
         sums.read_secs += (end - begin) as f64 / 1e9;
-        for (grasp_id, is_kept) in reported.into_iter().filter(|(grasp_id, _)| !labelled.contains(grasp_id)) {
-            self.count_truth(&reported_truth(path, grasp_id, is_kept), &mut sums.qualities);
+        for (grasp_id, is_kept) in reported {
+            labels.entry(grasp_id).or_insert_with(|| reported_truth(path, grasp_id, is_kept));
         }
+        labels.values().for_each(|truth| self.count_truth(truth, &mut sums.qualities));
         self.problems.extend(problems.found().into_iter().map(|problem| FoundProblem {
             recording: path.display().to_string(),
             message: problem.to_string(),

@@ -214,7 +214,12 @@ impl Decisions {
                     read.outcomes.insert(sample.message.grasp_id, sample.message.held);
                     false
                 }
-                Record::Truth(sample) => read.truths.insert(sample.message.grasp_id, sample.message).is_some(),
+                // An object that was kept may be dropped after that.
+                Record::Truth(sample) => {
+                    let is_drop = !sample.message.stable;
+                    let before = read.truths.insert(sample.message.grasp_id, sample.message);
+                    before.is_some_and(|before| !(before.stable && is_drop))
+                }
                 _ => false,
             };
             read.n_again += usize::from(is_again);

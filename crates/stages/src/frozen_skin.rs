@@ -1,7 +1,7 @@
 //! Finds a skin that has stopped: its bus sends the last readings again, in which the fingers still feel the object.
 //!
 //! Some skins are coarse and read the same numbers again by chance. So the frames of the resting hand show how probable that is,
-//! grasp by grasp; a skin that does not flicker at rest is never called frozen. Pure: no clock, no I/O.
+//! grasp by grasp; a skin that does not flicker at rest, or that only creeps there, is never called frozen. Pure: no clock, no I/O.
 
 use std::hash::{DefaultHasher, Hash, Hasher};
 
@@ -20,8 +20,11 @@ pub struct FrozenSkin {
     phase: Phase,
     /// Of the readings of its cells; 0 if no cell felt.
     digest: u64,
-    /// How many frames of the resting hand read other numbers than the frame before, and how many the same.
-    n_new: u32,
+    /// The sum of its cells, and whether it was the greater one of two.
+    newtons: f64,
+    is_rising: bool,
+    /// How often the load of the resting hand began to rise or to fall, and how many frames read the same as the one before.
+    n_turns: u32,
     n_again: u32,
     /// How many of the last frames read the same as the frame before them.
     n_in_a_row: u32,
@@ -46,18 +49,20 @@ impl FrozenSkin {
             self.n_in_a_row += 1;
             return self.is_frozen();
         }
-        if is_at_rest && feels && before != 0 {
-            self.n_new += 1;
-        }
+        // A run that a chance does not explain says nothing of chance.
         if !self.is_frozen() {
             self.n_again += self.n_in_a_row;
         }
         self.n_in_a_row = 0;
+        let newtons = cells_newtons.iter().sum();
+        let is_rising = newtons > std::mem::replace(&mut self.newtons, newtons);
+        let has_turned = std::mem::replace(&mut self.is_rising, is_rising) != is_rising;
+        self.n_turns += u32::from(is_at_rest && feels && before != 0 && has_turned);
         false
     }
 
     fn is_frozen(&self) -> bool {
-        let again = f64::from(self.n_again + 1) / f64::from(self.n_again + self.n_new + 1);
+        let again = f64::from(self.n_again + 1) / f64::from(self.n_again + self.n_turns + 1);
         again.powi(self.n_in_a_row as i32) <= BY_CHANCE
     }
 
@@ -97,15 +102,16 @@ mod tests {
 
     #[test]
     fn a_skin_that_stops_is_found_unless_it_is_coarse_or_feels_nothing() {
-        // Six readings that differed: the next one is the same with a probability of 1/6, and eight are with less than 1e-6.
-        assert_eq!(frozen("abcdef|ggggggggggh"), "..............!!.");
-        assert_eq!(frozen("abcdef|-----------"), ".................");
+        // Five turns: the next reading is the same with a probability of 1/6, and eight are with less than 1e-6.
+        assert_eq!(frozen("bacbdce|ggggggggggh"), "...............!!.");
+        assert_eq!(frozen("bacbdce|-----------"), "..................");
         // It stops when the hand has just settled.
-        assert_eq!(frozen("abcdddddddddddddddd"), ".............!!!!!!");
-        // A source that sends one frame again and again, and a coarse skin.
+        assert_eq!(frozen("bacbbbbbbbbbbbbbbbb"), ".............!!!!!!");
+        // A source that sends one frame again and again, a coarse skin, and one that creeps to rest.
         assert_eq!(frozen("aaaaaaaaaaaaaaaaaaaaaaaa"), ".".repeat(24));
-        assert_eq!(frozen("aabbccddeeff|gggggggggggggggggggg"), ".".repeat(32));
+        assert_eq!(frozen("aabbaabbaabb|gggggggggggggggggggg"), ".".repeat(32));
+        assert_eq!(frozen("abcdefg|gggggggggggggggggggg"), ".".repeat(27));
         // It goes on, and stops again.
-        assert_eq!(frozen("abcdef|gggggggggghggggggggg"), "..............!!.........!");
+        assert_eq!(frozen("bacbdce|gggggggggghggggggggg"), "...............!!.........!");
     }
 }

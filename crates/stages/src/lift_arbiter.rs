@@ -104,8 +104,8 @@ pub struct LiftArbiter {
     broken: Option<(u64, u64, i128)>,
     /// The last grasp that was held for want of good frames, and why, sentence by sentence.
     held: Option<(u64, Vec<String>)>,
-    /// The last decided grasp whose hand has opened, and whether it has settled again after that.
-    reopened: Option<(u64, bool)>,
+    /// Epoch and number of the last decided grasp whose hand has opened, and whether it has settled again after that.
+    reopened: Option<((u64, u64), bool)>,
 }
 
 /// The limit that makes a grasp stale, and what was found.
@@ -171,7 +171,7 @@ pub struct ArbiterState {
     /// The last lifted grasp, if its outcome has not come.
     lifted: Option<u64>,
     /// The last lifted grasp whose object was kept, and the promise before that: it may still be dropped.
-    kept: Option<(u64, PromiseMonitor)>,
+    kept: Option<((u64, u64), PromiseMonitor)>,
     /// The watch of the last lift.
     watch: Option<LiftWatch>,
     /// The lifts that were watched before that one: [`WATCH_COUNTS`](crate::lift_watch::WATCH_COUNTS).
@@ -456,10 +456,13 @@ impl LiftArbiter {
             // A frame after a lost one is judged all the same, but an answer is about the last frames.
             let has_place = arrival.break_in_order.is_none() || arrival.is_later && prediction.phase == Phase::Lifting;
             let is_trusted = has_place && arrival.is_valid && arrival.stale.is_none();
+            if arrival.break_in_order.is_some() {
+                watch.miss();
+            }
             decisions.extend(watch.on_prediction(header, prediction, is_trusted, options.votes.max(1), silence_nanos));
         }
         let Some(open) = self.open((header.epoch, prediction.grasp_id), decisions) else {
-            self.note_reuse(prediction);
+            self.note_reuse(header.epoch, prediction);
             return;
         };
         let meaning = open.meaning_of(prediction.phase);
@@ -594,8 +597,8 @@ impl LiftArbiter {
     /// Counts the outcome of the last lift, once. An object that was kept may be dropped after that, which counts in its place.
     fn observe_outcome(&mut self, header: &Header, prediction: &Prediction, break_in_order: Option<Reason>) {
         let Some(is_kept) = prediction.phase.outcome() else { return };
-        let grasp_id = prediction.grasp_id;
-        if !self.state.decided.contains((header.epoch, grasp_id)) || break_in_order == Some(Reason::WrongHand) {
+        let (epoch, grasp_id) = (header.epoch, prediction.grasp_id);
+        if !self.state.decided.contains((epoch, grasp_id)) || break_in_order == Some(Reason::WrongHand) {
             return;
         }
         let state = &mut self.state;
@@ -604,8 +607,8 @@ impl LiftArbiter {
             if prediction.fault == Fault::Changed {
                 state.promise.begin_anew();
             }
-            state.kept = is_kept.then(|| (grasp_id, state.promise.clone()));
-        } else if let Some((_, before)) = state.kept.take_if(|(kept, _)| !is_kept && *kept == grasp_id) {
+            state.kept = is_kept.then(|| ((epoch, grasp_id), state.promise.clone()));
+        } else if let Some((_, before)) = state.kept.take_if(|(kept, _)| !is_kept && *kept == (epoch, grasp_id)) {
             state.promise = before;
         } else {
             return;
@@ -615,19 +618,20 @@ impl LiftArbiter {
     }
 
     /// Takes note of a decided grasp whose hand opens, and of the first frame with which it settles again.
-    fn note_reuse(&mut self, prediction: &Prediction) {
-        let is_known = self.reopened.is_some_and(|(grasp_id, _)| grasp_id == prediction.grasp_id);
+    fn note_reuse(&mut self, epoch: u64, prediction: &Prediction) {
+        let grasp = (epoch, prediction.grasp_id);
+        let is_known = self.reopened.is_some_and(|(of, _)| of == grasp);
         match prediction.phase {
-            Phase::Open if !is_known => self.reopened = Some((prediction.grasp_id, false)),
-            Phase::Settled if is_known => self.reopened = Some((prediction.grasp_id, true)),
+            Phase::Open if !is_known => self.reopened = Some((grasp, false)),
+            Phase::Settled if is_known => self.reopened = Some((grasp, true)),
             _ => {}
         }
     }
 
-    /// Whether the hand of this grasp has opened and settled again since it was decided: its source seems to grasp anew under the
-    /// same number, which decides nothing.
-    pub fn is_reused(&self, grasp_id: u64) -> bool {
-        self.reopened == Some((grasp_id, true))
+    /// Whether the hand of a grasp, given by epoch and number, has opened and settled again since the grasp was decided: its source
+    /// seems to grasp anew under the same number, which decides nothing.
+    pub fn is_reused(&self, grasp: (u64, u64)) -> bool {
+        self.reopened == Some((grasp, true))
     }
 
     /// The grasp of that number, opened if it is new, after the one before it has been ended; `None` if it is decided.
@@ -1068,12 +1072,17 @@ mod tests {
             ("aaaaUe", Reason::NoAgreement),
             ("vvxe", Reason::NoAgreement),
             ("aLaaae", Reason::Stable),
+            // A frame is lost between the votes, or they are far apart.
+            ("aaLae", Reason::NoAgreement),
+            ("aaGae", Reason::NoAgreement),
         ] {
             let mut s = stream(ArbiterOptions::default());
             s.takes("+++[0 Lift Stable]");
             let said: Vec<LiftDecision> = history.chars().flat_map(|letter| s.take(letter)).collect();
             let said: Vec<_> = said.iter().map(|decision| (decision.action, decision.reason)).collect();
             assert_eq!(said, [(Action::GoOn, expected)], "{history}");
+            // What was felt before the question answers no other one.
+            s.takes("e[0 GoOn NoAgreement]");
         }
     }
 
@@ -1085,9 +1094,12 @@ mod tests {
         s.takes("c+++[0 Lift Stable]++e");
         assert_eq!(s.push(open, 0), []);
         s.takes("cc");
-        assert!(!s.arbiter.is_reused(0));
+        assert!(!s.arbiter.is_reused((0, 0)));
         s.takes("+++");
-        assert!(s.arbiter.is_reused(0) && !s.arbiter.is_reused(1));
+        assert!(s.arbiter.is_reused((0, 0)) && !s.arbiter.is_reused((0, 1)));
+        // Another run of the source has a grasp of this number.
+        s.takes("E+++[0 Lift Stable]+");
+        assert!(!s.arbiter.is_reused((1, 0)));
     }
 
     #[test]

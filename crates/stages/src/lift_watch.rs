@@ -80,9 +80,13 @@ impl LiftWatch {
         (self.n_stable, self.n_slipping, self.n_unstable) = (0, 0, 0);
     }
 
-    /// Takes note of a reading that nobody could judge.
+    /// Takes note of a reading that was lost or could not be judged.
     pub(crate) fn miss(&mut self) {
         self.n_stable = 0;
+    }
+
+    fn has_voted_within(&self, nanos: u64, header: &Header) -> bool {
+        header.stamp_nanos.saturating_sub(self.voted_nanos) <= nanos
     }
 
     /// Takes a prediction, and returns the action that the arm should take, if any. A prediction that is not trusted has no
@@ -103,6 +107,9 @@ impl LiftWatch {
         match prediction.phase {
             Phase::Lifting => {
                 self.has_begun = true;
+                if !self.has_voted_within(fresh_nanos, header) {
+                    self.miss();
+                }
                 self.count(header, prediction, is_trusted);
                 if self.n_unstable >= votes {
                     self.is_set_down = true;
@@ -111,8 +118,8 @@ impl LiftWatch {
                 if self.tightens(votes) { Some(self.says(Action::Tighten, Reason::Slipping)) } else { None }
             }
             Phase::Ended if self.has_begun => {
-                let is_fresh = header.stamp_nanos.saturating_sub(self.voted_nanos) <= fresh_nanos;
-                let is_stable = is_trusted && is_fresh && std::mem::take(&mut self.n_stable) >= votes;
+                let n_stable = std::mem::take(&mut self.n_stable);
+                let is_stable = is_trusted && self.has_voted_within(fresh_nanos, header) && n_stable >= votes;
                 Some(self.says(Action::GoOn, if is_stable { Reason::Stable } else { Reason::NoAgreement }))
             }
             _ => None,

@@ -49,7 +49,7 @@ pub struct OddReadings {
     rest_newtons: [f64; MAX_PADS],
     /// For each pad: in how many frames in a row its load has been another one.
     n_changed: [u32; MAX_PADS],
-    /// The sentence about a joint or a load that has moved in the settled hand.
+    /// The sentence about a joint or a load that has moved in the resting hand.
     unrest: Option<String>,
     /// The greatest force of a contact of the settled hand.
     greatest_newtons: f64,

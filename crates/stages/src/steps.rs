@@ -58,7 +58,7 @@ pub fn find_contacts<'a>(
             let mut summary = memory.finder.find(hand, head.header.hand_id, joints, steady, contacts);
             if let (Ok(phase), Fault::None | Fault::NoContact) = (phase, summary.fault) {
                 memory.odd.note(hand, place, phase, (joints, cells_newtons), contacts);
-                if memory.frozen.note(place, phase, cells_newtons, summary.fault == Fault::None) {
+                if !phase.is_over() && memory.frozen.note(place, phase, cells_newtons, summary.fault == Fault::None) {
                     summary = ContactSummary { fault: Fault::SensorFault, ..ContactSummary::default() };
                     contacts.clear();
                 }
@@ -218,5 +218,26 @@ mod tests {
         let set = contact_set(&hand, &head, summary, parts.as_ref());
         stops[0] = 0.51;
         assert_eq!(set.joints(), Ok(&stops[..]));
+    }
+
+    #[test]
+    fn the_frames_of_a_skin_that_has_stopped_are_faulty() {
+        let hand = Hand::load(Path::new("barrett-bh8-280")).expect("built in");
+        let (mut memory, mut contacts, mut faults) = (ContactMemory::default(), Vec::new(), Vec::new());
+        let phases = [(Phase::Settled, 8), (Phase::TestLifting, 12), (Phase::Kept, 1)];
+        let phases = phases.into_iter().flat_map(|(phase, n)| std::iter::repeat_n(phase, n));
+        for (idx, phase) in phases.enumerate() {
+            let mut cells_newtons = vec![0.0; hand.n_cells()];
+            // Up and down, until it stops.
+            cells_newtons[30] = 2.0 + 0.01 * (idx.min(8) % 2 * idx.min(8)) as f64;
+            let frame =
+                TactileFrame { phase, joints: vec![0.5; hand.joints.len()], cells_newtons, ..TactileFrame::default() };
+            let (head, items) = frame.to_parts(Header { hand_id: hand.id(), seq: idx as u64, ..Header::default() });
+            faults.push(find_contacts(&hand, &mut memory, &head, &items, &mut contacts).0.fault);
+        }
+        let first = faults.iter().position(|fault| *fault == Fault::SensorFault).expect("found");
+        assert!((12..19).contains(&first), "{faults:?}");
+        assert!(faults[first..20].iter().all(|fault| *fault == Fault::SensorFault));
+        assert_eq!((faults[0], faults[20]), (Fault::None, Fault::None));
     }
 }

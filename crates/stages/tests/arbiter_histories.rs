@@ -257,7 +257,7 @@ fn may_react(history: &[Input], lifted: &[(usize, u64)], decision: &LiftDecision
     let votes = options.votes as usize;
     if decision.action == Action::GoOn {
         let mut latest = readings.take(votes);
-        let are_stable = latest.all(|pair| has_vote(&pair) && pair[1].prediction.stable);
+        let are_stable = latest.all(|pair| pair[1].follows(pair[0]) && has_vote(&pair) && pair[1].prediction.stable);
         return last.prediction.phase == Phase::Ended && (decision.reason == Reason::NoAgreement || are_stable);
     }
     let is_slipping =

@@ -133,7 +133,7 @@ fn import_lines(arguments: &Arguments, hand: &Hand) -> anyhow::Result<Outcome> {
     let name = file_name(&arguments.table);
     let report = import_frames(&name, hand, &frames, &truths, &outcomes, label, &arguments.out)?;
     for (topic, n) in &n_left_out {
-        print_diagnostic(&format!("{n} samples of {topic} are left out"));
+        print_diagnostic(&format!("left out: {} of {topic}", counted(*n, "sample")));
     }
     if arguments.json {
         print_text(&serde_json::to_string_pretty(&report)?)?;

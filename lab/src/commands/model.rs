@@ -146,8 +146,8 @@ fn adapt_model(arguments: &AdaptArguments) -> anyhow::Result<Outcome> {
     if let Some((estimate, bound)) = refuted(&before, &model) {
         let [estimate, bound] = [estimate, bound].map(|share| percent(Some(share)));
         print_diagnostic(&format!(
-            "warning: of the lifts that it makes {estimate} drop, and the model before promised at most {bound}: learn anew with \
-             these lifts (blindgrasp train), or lift surer grasps only (blindgrasp set lift_arbiter.min_probability_stable)"
+            "warning: {estimate} of the adapted model's lifts drop the object, and the model before promised at most {bound}: learn anew \
+             with these lifts (blindgrasp train), or lift surer grasps only (blindgrasp set lift_arbiter.min_probability_stable)"
         ));
     }
     Ok(Outcome::Done)

@@ -247,7 +247,7 @@ fn labels_of_exported_lines_keep_stamp_and_epoch() {
     let lines_only =
         ["import", "--lines", &file, "--hand", HAND, "--overwrite", "--json", "--out", &folder.at("out.mcap")];
     let output = run(&lines_only, 0);
-    assert_eq!(text(&output.stderr), "240 samples of /scene are left out\n");
+    assert_eq!(text(&output.stderr), "left out: 240 samples of /scene\n");
     let report: Value = serde_json::from_slice(&output.stdout).expect("a report");
     assert_eq!(
         (&report["n_kept"], &report["n_dropped"], &report["n_without_frames"]),

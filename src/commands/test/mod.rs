@@ -125,11 +125,11 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     if let Some(folder) = &arguments.keep {
         print_diagnostic(&format!("kept in {}", folder.display()));
     }
+    let n_failed = cases.iter().filter(|case| !case.has_passed()).count();
     if cases.len() < recordings.len() {
-        let _ = printed;
-        bail!("stopped after {} of {} recordings", cases.len(), recordings.len());
+        bail!("stopped after {} of {} recordings, of which {n_failed} failed", cases.len(), recordings.len());
     }
-    match cases.iter().filter(|case| !case.has_passed()).count() {
+    match n_failed {
         0 => printed.map(|()| Outcome::Done),
         n_failed => bail!("{n_failed} of {} recordings failed", cases.len()),
     }

@@ -15,6 +15,8 @@ use blindgrasp_stages::label::Label;
 
 /// Number and epoch of a grasp.
 type GraspKey = (u64, u64);
+/// The labels of grasps, with their own headers as far as they have any.
+type Labels = BTreeMap<GraspKey, (Option<Header>, GraspTruth)>;
 
 /// The report of an import of frames.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
@@ -43,7 +45,7 @@ pub fn import_frames(
     name: &str,
     hand: &Hand,
     frames: &[Stamped<TactileFrame>],
-    truths: &BTreeMap<GraspKey, (Option<Header>, GraspTruth)>,
+    truths: &Labels,
     lifts: &[Stamped<LiftOutcome>],
     label: Option<Label>,
     out: &Path,
@@ -102,7 +104,7 @@ fn write_known(
     recording: &mut RecordingWriter,
     hand: &Hand,
     seen: &BTreeMap<GraspKey, Header>,
-    (truths, label): (&BTreeMap<GraspKey, (Option<Header>, GraspTruth)>, Option<Label>),
+    (truths, label): (&Labels, Option<Label>),
     lifts: &[Stamped<LiftOutcome>],
 ) -> Result<(BTreeMap<GraspKey, bool>, usize), RecordingError> {
     let (mut outcomes, mut n_without_frames) = (BTreeMap::new(), 0);
