@@ -172,7 +172,8 @@ impl Node {
         if let Some(mut stderr) = self.0.stderr.take() {
             stderr.read_to_string(&mut said).expect("read");
         }
-        assert!(self.0.wait().expect("ended").success(), "{said}");
+        let status = self.0.wait().expect("ended");
+        assert!(status.success(), "{status}: {said}");
     }
 }
 
