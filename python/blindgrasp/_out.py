@@ -35,14 +35,16 @@ OUTCOME = {
     "turn_rad": "float64", "epsilon": "float64", "volume": "float64", "mass_kg": "float64", "friction": "float64",
     "thing": "string", "group": "string", "probed": "bool", "disturbed": "bool",
 }  # fmt: skip
-# Of a field of an outcome that is not known.
+# The columns of those fields.
+OUTCOMES = {f"outcome_{name}": kind for name, kind in OUTCOME.items()}
+# The value of a field of an outcome that is not known, by its type.
 MISSING_OF: dict[str, Any] = {"bool": False, "uint64": 0, "float64": None, "string": ""}
 # What is equal for all frames of a grasp.
 OF_GRASP = {
     "recording": "string", "hand": "string", "hand_id": "string", "model": "string", "day": "int64", "epoch": "uint64",
     "grasp_id": "uint64", "stable": "bool", "label": "string", "object": "string", "object_class": "string", "epsilon": "float64",
     "volume": "float64", "action": "string", "reason": "string", "probability_stable": "float64",
-    **(OUTCOMES := {f"outcome_{name}": kind for name, kind in OUTCOME.items()}),
+    **OUTCOMES,
 }  # fmt: skip
 # Those without which a grasp cannot be read back.
 NEEDED = ("hand_id", "epoch", "grasp_id", "stable")

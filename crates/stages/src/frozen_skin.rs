@@ -18,9 +18,9 @@ pub struct FrozenSkin {
     /// Epoch and grasp of the last frame.
     grasp: Option<(u64, u64)>,
     phase: Phase,
-    /// Of the readings of its cells; 0 if no cell felt.
+    /// A digest of the readings of its cells; 0 if no cell felt.
     digest: u64,
-    /// The sum of its cells, and whether it was the greater one of two.
+    /// The sum of its cells, and whether that was greater than the sum before.
     newtons: f64,
     is_rising: bool,
     /// How often the load of the resting hand began to rise or to fall, and how many frames read the same as the one before.
@@ -49,7 +49,7 @@ impl FrozenSkin {
             self.n_in_a_row += 1;
             return self.is_frozen();
         }
-        // A run that a chance does not explain says nothing of chance.
+        // Readings of a skin that has stopped do not show how often a healthy one repeats its readings.
         if !self.is_frozen() {
             self.n_again += self.n_in_a_row;
         }

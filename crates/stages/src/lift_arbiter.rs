@@ -1081,7 +1081,7 @@ mod tests {
             let said: Vec<LiftDecision> = history.chars().flat_map(|letter| s.take(letter)).collect();
             let said: Vec<_> = said.iter().map(|decision| (decision.action, decision.reason)).collect();
             assert_eq!(said, [(Action::GoOn, expected)], "{history}");
-            // What was felt before the question answers no other one.
+            // Frames before a question answer no later question.
             s.takes("e[0 GoOn NoAgreement]");
         }
     }

@@ -241,7 +241,7 @@ fn labels_of_exported_lines_keep_stamp_and_epoch() {
     let mut expected = json_lines(lines.as_bytes());
     expected.retain(|line| line["topic"] == "/truth");
     assert_eq!(folder.exported("/truth"), expected);
-    // The paper's label is no outcome of a lift, and stays what it is.
+    // The paper's label is no outcome of a lift, and keeps its meaning.
     let exported = text(&run(&["export", "recordings/held-out.mcap"], 0).stdout);
     let file = folder.write("held-out.jsonl", exported.clone());
     let lines_only =
