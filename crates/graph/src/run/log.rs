@@ -97,26 +97,26 @@ impl<S: RunSink> RunLog<S> {
         }
     }
 
-    /// Adds a truth that came after its decision to the graph's status. Returns whether that still has the decision.
-    fn show_truth(&self, truth: &GraspTruth) -> bool {
+    /// Adds a truth that came after its decision, or after the truth `before`, to the graph's status. Returns whether it has the
+    /// decision with that truth.
+    fn show_truth(&self, truth: &GraspTruth, before: Option<bool>) -> bool {
         let mut status = self.status.lock().unwrap_or_else(PoisonError::into_inner);
-        let decided = status.latest.iter_mut().rfind(|decided| decided.grasp_id == truth.grasp_id);
+        let decided = status.latest.iter_mut().rfind(|it| it.grasp_id == truth.grasp_id && it.truth == before);
         let Some(decided) = decided else { return false };
-        let was_false_positive = decided.is_false_positive();
         decided.truth = Some(truth.stable);
         let is_false_positive = decided.is_false_positive();
-        status.n_false_positives += u64::from(is_false_positive && !was_false_positive);
+        status.n_false_positives += u64::from(is_false_positive);
         true
     }
 
     fn on_truth(&mut self, truth: GraspTruth) {
         match self.decisions.remove(&truth.grasp_id) {
             Some(decision) => {
-                self.show_truth(&truth);
+                self.show_truth(&truth, None);
                 self.evaluation.add(&decision, Some(&truth));
             }
             // An object that was kept may be dropped after that.
-            None if !truth.stable && self.show_truth(&truth) => {}
+            None if !truth.stable && self.show_truth(&truth, Some(true)) => {}
             None => drop(self.truths.insert(truth.grasp_id, truth)),
         }
         // A decision comes soon after its truth: the oldest truths will have none.
