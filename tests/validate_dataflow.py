@@ -1,4 +1,4 @@
-"""Validates dataflow files against a JSON Schema, by jsonschema and ruamel.yaml.
+"""Validates dataflow files against a JSON Schema, by jsonschema, as ruamel.yaml and PyYAML read them.
 
     python tests/validate_dataflow.py SCHEMA FILE...
 
@@ -10,13 +10,14 @@ import sys
 from pathlib import Path
 
 import jsonschema
+import yaml
 from ruamel.yaml import YAML
 
 schema = json.loads(Path(sys.argv[1]).read_text())
 jsonschema.Draft202012Validator.check_schema(schema)
 validator = jsonschema.Draft202012Validator(schema)
 for file in sys.argv[2:]:
-    # YAML 1.2, as editors read it: `on` is a text.
-    document = YAML(typ="safe", pure=True).load(Path(file))
-    errors = sorted(validator.iter_errors(document), key=lambda error: list(map(str, error.absolute_path)))
+    # YAML 1.2, as editors read it, in which `on` is a text, and YAML 1.1, in which it is true.
+    documents = [YAML(typ="safe", pure=True).load(Path(file)), yaml.safe_load(Path(file).read_text())]
+    errors = [error for document in documents for error in validator.iter_errors(document)]
     print(json.dumps({"file": file, "errors": [f"{'/'.join(map(str, e.absolute_path))}: {e.message}" for e in errors]}))

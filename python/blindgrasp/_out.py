@@ -451,6 +451,9 @@ class _LeRobot:
         names = ["episode_index", "length", "dataset_from_index", "dataset_to_index"]
         names += [f"{folder}/{kind}_index" for folder in ("data", "meta/episodes") for kind in ("chunk", "file")]
         types = [(name, pa.int64()) for name in names] + [("tasks", pa.list_(pa.string()))]
+        # LeRobot's tools make the statistics of a part of the episodes from these.
+        of_episode = {key: pa.list_(pa.float64()) for key in ("min", "max", "mean", "std")} | {"count": pa.list_(pa.int64())}
+        types += [(f"stats/{name}/{key}", kind) for name in self.stats for key, kind in of_episode.items()]
         schema = pa.schema(types + [(name, pa.type_for_alias(kind)) for name, kind in OF_GRASP.items()])
         episodes = pa.Table.from_pylist(self.episodes, schema)
         _write(root / "meta/episodes/chunk-000/file-000.parquet", schema, iter([episodes]))
@@ -475,7 +478,7 @@ class _LeRobot:
             "video_path": None,
             "features": self.features,
         }
-        stats = {name: self._final(sums) for name, sums in self.stats.items()}
+        stats = {name: _statistics(sums, self.n_frames) for name, sums in self.stats.items()}
         for name, content in (("info", info), ("stats", stats)):
             (root / f"meta/{name}.json").write_text(json.dumps(content, indent=4), encoding="utf-8")
 
@@ -487,7 +490,8 @@ class _LeRobot:
             episode = {"episode_index": len(self.episodes), "length": n, "tasks": [task]}
             episode |= {"dataset_from_index": self.n_frames, "dataset_to_index": self.n_frames + n}
             episode |= {f"data/{key}": idx for key, idx in place.items()}
-            self.episodes.append(episode | {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0} | known)
+            episode |= {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0} | known
+            self.episodes.append(episode)
             frames = np.arange(n)
             columns: dict[str, Any] = {
                 "phase": grasp.phase.tolist(),
@@ -503,25 +507,29 @@ class _LeRobot:
             }
             for sense, feature in self.feature_of.items():
                 rows = self.data.rows(grasp, sense)
-                self._add(feature, rows)
+                sums = _sums(rows)
+                self.stats[feature] = _both(self.stats[feature], sums) if feature in self.stats else sums
+                episode |= {f"stats/{feature}/{key}": value for key, value in _statistics(sums, n).items()}
                 values = self.pa.array(rows.ravel())
                 columns[feature] = values if rows.shape[1] == 1 else self.pa.FixedSizeListArray.from_arrays(values, rows.shape[1])
             self.n_frames += n
             yield self.pa.table(columns, self.schema)
 
-    def _add(self, name: str, rows: NDArray[np.float64]) -> None:
-        """Adds rows to the sums of a feature; NaN counts for nothing."""
-        low, high = np.fmin.reduce(rows), np.fmax.reduce(rows)
-        found = {"n": np.sum(~np.isnan(rows), axis=0), "sum": np.nansum(rows, axis=0), "squares": np.nansum(rows**2, axis=0)}
-        before = self.stats.get(name)
-        if before is not None:
-            low, high = np.fmin(low, before["min"]), np.fmax(high, before["max"])
-            found = {key: before[key] + value for key, value in found.items()}
-        self.stats[name] = found | {"min": low, "max": high}
 
-    def _final(self, sums: dict[str, Any]) -> dict[str, Any]:
-        n = np.maximum(sums["n"], 1)
-        mean = sums["sum"] / n
-        std = np.sqrt(np.maximum(sums["squares"] / n - mean**2, 0.0))
-        found = {"min": sums["min"], "max": sums["max"], "mean": mean, "std": std}
-        return {key: value.tolist() for key, value in found.items()} | {"count": [self.n_frames]}
+def _sums(rows: NDArray[np.float64]) -> dict[str, Any]:
+    """The sums of rows, of which `_statistics` makes their statistics; NaN counts for nothing."""
+    found = {"n": np.sum(~np.isnan(rows), axis=0), "sum": np.nansum(rows, axis=0), "squares": np.nansum(rows**2, axis=0)}
+    return found | {"min": np.fmin.reduce(rows), "max": np.fmax.reduce(rows)}
+
+
+def _both(one: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
+    how = {"min": np.fmin, "max": np.fmax}
+    return {key: how.get(key, np.add)(value, other[key]) for key, value in one.items()}
+
+
+def _statistics(sums: dict[str, Any], n_frames: int) -> dict[str, Any]:
+    n = np.maximum(sums["n"], 1)
+    mean = sums["sum"] / n
+    std = np.sqrt(np.maximum(sums["squares"] / n - mean**2, 0.0))
+    found = {"min": sums["min"], "max": sums["max"], "mean": mean, "std": std}
+    return {key: value.tolist() for key, value in found.items()} | {"count": [n_frames]}

@@ -14,6 +14,7 @@ import argparse
 import os
 import sys
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -220,25 +221,29 @@ class _Conversion:
     def _add_shape(self, geom: int, link: str, origin: np.ndarray) -> None:
         model, kinds = self.model, self.mujoco.mjtGeom
         kind, size = int(model.geom_type[geom]), model.geom_size[geom]
-        shapes = {
-            int(kinds.mjGEOM_SPHERE): lambda: ("sphere", {"radius": _text(size[:1])}),
-            int(kinds.mjGEOM_CAPSULE): lambda: ("capsule", {"radius": _text(size[:1]), "length": _text(2 * size[1:2])}),
-            int(kinds.mjGEOM_CYLINDER): lambda: ("cylinder", {"radius": _text(size[:1]), "length": _text(2 * size[1:2])}),
-            int(kinds.mjGEOM_BOX): lambda: ("box", {"size": _text(2 * size)}),
-            int(kinds.mjGEOM_ELLIPSOID): lambda: ("mesh", {"filename": self._ellipsoid(geom)}),
-            int(kinds.mjGEOM_MESH): lambda: ("mesh", {"filename": self._mesh(geom)}),
+        ends = {"radius": _text(size[:1])}
+        along = ends | {"length": _text(2 * size[1:2])}
+        # Each shape, and how far it lies from the middle along z. URDF as ROS reads it has no capsules.
+        shapes: dict[int, Any] = {
+            int(kinds.mjGEOM_SPHERE): lambda: [("sphere", ends, 0.0)],
+            int(kinds.mjGEOM_CAPSULE): lambda: [
+                ("cylinder", along, 0.0), ("sphere", ends, size[1]), ("sphere", ends, -size[1])
+            ],
+            int(kinds.mjGEOM_CYLINDER): lambda: [("cylinder", along, 0.0)],
+            int(kinds.mjGEOM_BOX): lambda: [("box", {"size": _text(2 * size)}, 0.0)],
+            int(kinds.mjGEOM_ELLIPSOID): lambda: [("mesh", {"filename": self._ellipsoid(geom)}, 0.0)],
+            int(kinds.mjGEOM_MESH): lambda: [("mesh", {"filename": self._mesh(geom)}, 0.0)],
         }
         if kind not in shapes:
             # A plane or a terrain is not part of a hand.
             return
-        name, attributes = shapes[kind]()
         element = next(element for element in self.robot if element.tag == "link" and element.get("name") == link)
-        collision = ElementTree.SubElement(element, "collision")
         rotation = _matrix(model.geom_quat[geom])
-        ElementTree.SubElement(
-            collision, "origin", xyz=_text(model.geom_pos[geom] - origin), rpy=_text(_rpy(rotation))
-        )
-        ElementTree.SubElement(ElementTree.SubElement(collision, "geometry"), name, attributes)
+        for name, attributes, aside_m in shapes[kind]():
+            collision = ElementTree.SubElement(element, "collision")
+            middle = model.geom_pos[geom] - origin + aside_m * rotation[:, 2]
+            ElementTree.SubElement(collision, "origin", xyz=_text(middle), rpy=_text(_rpy(rotation)))
+            ElementTree.SubElement(ElementTree.SubElement(collision, "geometry"), name, attributes)
 
     def _mesh(self, geom: int) -> str:
         model, mesh = self.model, int(self.model.geom_dataid[geom])

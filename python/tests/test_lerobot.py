@@ -205,6 +205,8 @@ class LeRobot(unittest.TestCase):
             self.assertEqual(episode["tasks"].tolist(), [grasp.label.object_id])
             np.testing.assert_array_equal(np.stack(rows["observation.tactile"]), grasp.cells_newtons)
             np.testing.assert_allclose(rows["timestamp"], np.arange(14) / 100, atol=1e-6)
+            mean = episode["stats/observation.tactile/mean"]
+            np.testing.assert_allclose(mean, grasp.cells_newtons.mean(axis=0), atol=1e-9)
         cells = np.concatenate([grasp.cells_newtons for grasp in grasps])
         stats = json.loads((root / "meta/stats.json").read_text())["observation.tactile"]
         for name, expected in (("mean", cells.mean(axis=0)), ("std", cells.std(axis=0)), ("max", cells.max(axis=0))):

@@ -789,6 +789,21 @@ def urdf_shapes(root, values):
 
 @unittest.skipUnless(importlib.util.find_spec("mujoco"), "the package mujoco is not installed")
 class Mjcf(Folder):
+    def assert_ros_reads(self, root):
+        """ROS's own parser asks for more than others do."""
+        for joint in root.iter("joint"):
+            if joint.get("type") in ("revolute", "prismatic"):
+                self.assertLessEqual({"lower", "upper", "effort", "velocity"}, set(joint.find("limit").keys()))
+        shapes = {shape.tag for geometry in root.iter("geometry") for shape in geometry}
+        self.assertLessEqual(shapes, {"box", "cylinder", "sphere", "mesh"})
+
+    def test_ros_reads_the_built_in_hands(self):
+        hands = sorted((Path(__file__).parents[2] / "hands").glob("*.urdf"))
+        self.assertGreater(len(hands), 5)
+        for hand in hands:
+            with self.subTest(hand.name):
+                self.assert_ros_reads(ElementTree.parse(hand).getroot())
+
     def test_a_mujoco_model_becomes_a_urdf_of_the_same_motion(self):
         import mujoco
         from blindgrasp.mjcf import urdf_of
@@ -810,7 +825,9 @@ class Mjcf(Folder):
                     link = shapes[model.body(model.geom_bodyid[geom]).name]
                     np.testing.assert_allclose(link[0][:3, 3], data.geom_xpos[geom], atol=1e-7)
                     np.testing.assert_allclose(link[0][:3, :3], data.geom_xmat[geom].reshape(3, 3), atol=1e-7)
-        self.assertEqual(sum(map(len, shapes.values())), 4)
+        # The capsule is a cylinder and two balls.
+        self.assertEqual(sum(map(len, shapes.values())), 6)
+        self.assert_ros_reads(root)
         listed = subprocess.run(
             [blindgrasp.program(), "new", "hand", str(self.folder / "mine"), "--urdf", str(urdf)],
             stdout=subprocess.PIPE, text=True, check=True,

@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use clap::Args;
 
+use blindgrasp_cli::secs_in;
 use blindgrasp_recording::LiveOptions;
 
 #[derive(Debug, Clone, Args)]
@@ -15,8 +16,8 @@ pub(super) struct RecordingArguments {
     #[arg(long, value_name = "SIZE", value_parser = bytes)]
     rotate_size: Option<u64>,
     /// Begin another file after this time (90s, 10m, 1h)
-    #[arg(long, value_name = "TIME", value_parser = humantime::parse_duration)]
-    rotate_every: Option<Duration>,
+    #[arg(long, value_name = "TIME", value_parser = |text: &str| secs_in(text, 0.1..=1e8))]
+    rotate_every: Option<f64>,
     /// Replace existing files
     #[arg(long)]
     overwrite: bool,
@@ -25,7 +26,8 @@ pub(super) struct RecordingArguments {
 impl RecordingArguments {
     pub(super) fn options(&self) -> LiveOptions {
         let RecordingArguments { rotate_size, rotate_every, overwrite } = *self;
-        LiveOptions { rotate_bytes: rotate_size, rotate_after: rotate_every, overwrite, ..LiveOptions::default() }
+        let rotate_after = rotate_every.map(Duration::from_secs_f64);
+        LiveOptions { rotate_bytes: rotate_size, rotate_after, overwrite, ..LiveOptions::default() }
     }
 }
 

@@ -39,7 +39,7 @@ const MAX_PRINTED: usize = 20;
 /// If a replacement fails, the old operator takes over again. The program of --run is run with --describe first, as the user
 /// of the graph.
 #[derive(Debug, Args)]
-#[command(after_help = "Examples: blindgrasp swap classifier --set model=models/new.json\n          \
+#[command(after_help = "Examples: blindgrasp swap encoder classifier --set model=models/new.json\n          \
                         blindgrasp swap classifier --run ./my_classifier --shadow 30 \
                         --min-agreement 0.99 --max-latency-p99-us 500\n\n\
                         With --machine, paths in --run and --set are paths there, relative to the dataflow file's folder.\n\

@@ -267,6 +267,8 @@ fn another_hand_or_a_model_unlike_its_neighbours_is_refused() {
     for node in ["encoder", "classifier"] {
         assert_refused(&graph, &[node, "--set", &model], &[&format!("'{node}' is made for the "), "--allow-mismatch"]);
     }
+    let in_shadow = ["encoder", "classifier", "--shadow", "0.5", "--set", &model];
+    assert_refused(&graph, &in_shadow, &["In the shadow it reads the running nodes", "view --shadow MODEL"]);
     graph.stop().assert_undisturbed("refused mismatches");
 }
 

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use serde::Deserialize;
 
 use blindgrasp_messages::{GraspTruth, Stamped, TactileFrame};
-use blindgrasp_recording::{Record, RecordingError, RecordingReader};
+use blindgrasp_recording::{Record, RecordingError, RecordingReader, ShownHand, attachments};
 use blindgrasp_stages::OtherHand;
 use blindgrasp_stages::hand::{Hand, HandError};
 use blindgrasp_stages::label::Label;
@@ -58,7 +58,8 @@ pub fn check_once(recordings: &[PathBuf]) -> Result<(), DatasetError> {
     Ok(())
 }
 
-/// The hand of `recording`: `hand` if given, else the built-in hand that the recording names.
+/// The hand of `recording`: `hand` if given, else the built-in hand that the recording names, with the thresholds of the pad
+/// layout that is attached to it.
 ///
 /// # Errors
 /// The hand cannot be read, or is not the recording's.
@@ -67,14 +68,28 @@ pub fn hand_of(recording: &Path, hand: Option<&Path>) -> Result<Hand, DatasetErr
     let info = reader.info();
     let hand = match hand {
         Some(path) => Hand::load(path)?,
-        // A stranger's recording names a hand, and no file.
-        None => Hand::built_in(&info.hand).ok_or_else(|| DatasetError::Unusable {
-            path: recording.into(),
-            message: format!("it was made with the hand '{}': name its pad layout with --hand", info.hand),
-        })?,
+        None => {
+            let built_in = Hand::built_in(&info.hand).ok_or_else(|| DatasetError::Unusable {
+                path: recording.into(),
+                message: format!("it was made with the hand '{}': name its pad layout with --hand", info.hand),
+            })?;
+            attached_hand(recording, &built_in).unwrap_or(built_in)
+        }
     };
     check_hand(recording, &reader, &hand)?;
     Ok(hand)
+}
+
+/// The hand whose files are attached to a recording, if its layout is not that of the built-in hand.
+fn attached_hand(recording: &Path, built_in: &Hand) -> Option<Hand> {
+    let files = attachments(recording).ok()?;
+    let text = |name: &str| {
+        let file = files.iter().find(|file| file.name == name)?;
+        String::from_utf8(file.data.to_vec()).ok()
+    };
+    let layout = text(ShownHand::LAYOUT_NAME).filter(|layout| *layout != built_in.files()[0])?;
+    let urdf = text(ShownHand::URDF_NAME)?;
+    Hand::parse(recording, &layout, |_| Ok(urdf)).ok()
 }
 
 /// The definition of stable in a recording whose labels are by a simulation; `None` for other recordings.

@@ -131,6 +131,14 @@ impl ParamKind {
 
     /// Reads a scalar of the file; `plain` when it had no quotes. The kind alone decides what the text means.
     pub fn accept_scalar(&self, text: &str, plain: bool) -> Option<Value> {
+        let text = match (self, text) {
+            // Programs that read YAML 1.1 write the words on and off as true and false.
+            (Self::Choice { values: words } | Self::Number { words, .. }, "true" | "false") if plain => {
+                let word = if text == "true" { "on" } else { "off" };
+                if words.iter().any(|known| known == word) { word } else { text }
+            }
+            _ => text,
+        };
         let value = match self {
             Self::Path { .. } | Self::String {} if plain && is_null(text) => None,
             Self::Path { .. } | Self::String {} | Self::Choice { .. } => Some(Value::from(text)),

@@ -141,7 +141,10 @@ impl fmt::Display for Staleness {
             }
             Staleness::Expiry { found_nanos, limit_nanos } => {
                 let (found, limit) = (millis(found_nanos), millis(limit_nanos));
-                write!(f, "a frame was {found:.1} ms old, and expired after {limit:.1} ms (set by its machine)")
+                write!(
+                    f,
+                    "a frame was {found:.1} ms old, and expired after {limit:.1} ms (deadline_ms of an edge, or its machine)"
+                )
             }
             Staleness::Future => f.write_str("a frame's time lies after this machine's clock"),
             Staleness::Unknown => {
@@ -980,7 +983,10 @@ mod tests {
         let said = |age_nanos| options.staleness_of(&header, age_nanos).map(|staleness| staleness.to_string());
         assert_eq!(said(50_000_000), None);
         let [expired, old, future] = [60_000_000, 312_000_000, u64::MAX].map(|age| said(age).expect("stale"));
-        assert_eq!(expired, "a frame was 60.0 ms old, and expired after 50.0 ms (set by its machine)");
+        assert_eq!(
+            expired,
+            "a frame was 60.0 ms old, and expired after 50.0 ms (deadline_ms of an edge, or its machine)"
+        );
         assert_eq!(old, "a frame was 312.0 ms old, expected at most 200.0 ms (max_age_ms)");
         assert!(future.contains("after this machine's clock"), "{future}");
         let unknown =

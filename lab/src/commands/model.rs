@@ -381,12 +381,13 @@ fn described(model: &Model) -> Vec<(&'static str, String)> {
         ("predictor", classifier.predictor.summary()),
         ("calibration", format!("Platt, a {:.4}, b {:.4}", classifier.calibration.a, classifier.calibration.b)),
         ("threshold", threshold_line(classifier)),
-        ("checksum", if model.checksum.is_empty() { "not saved".into() } else { model.checksum.clone() }),
     ];
     if training.n_grasps > 0 {
         described.extend(of_training(training, training_range));
     }
     let optional = [
+        // A model that was made just now has none.
+        ("checksum", (!model.checksum.is_empty()).then(|| model.checksum.clone())),
         ("label", label_line(&training.labels)),
         ("day", day_line(model)),
         ("recalibrated", recalibration_line(model)),

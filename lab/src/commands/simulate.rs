@@ -22,7 +22,7 @@ use blindgrasp_objects::{objects_id, objects_named};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_recording::{Manifest, RecordingError, RecordingInfo, RecordingReader, RecordingWriter, part_path};
 use blindgrasp_simulator::candidate::SimulatedGrasp;
-use blindgrasp_simulator::options::{SimulatorOptions, Thresholds, check_hand};
+use blindgrasp_simulator::options::{LiftOptions, SimulatorOptions, Thresholds, check_hand};
 use blindgrasp_simulator::protocol::Approach;
 use blindgrasp_simulator::simulator::{Part, SimulateError, Simulation, SimulationReport};
 use blindgrasp_simulator::trial::{PhysicsEngine, read_options};
@@ -422,6 +422,8 @@ struct AllOptions<'a> {
     label: Option<Label>,
     #[serde(skip_serializing_if = "Option::is_none")]
     thresholds: Option<Thresholds>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    lift: Option<&'a LiftOptions>,
     #[serde(flatten)]
     options: &'a SimulatorOptions,
 }
@@ -431,6 +433,8 @@ impl<'a> AllOptions<'a> {
         AllOptions {
             label: (options.label == Label::default()).then_some(options.label),
             thresholds: options.thresholds.is_default().then_some(options.thresholds),
+            // Without the label `lift` they must not be set.
+            lift: (options.label == Label::Lift && options.lift.is_default()).then_some(&options.lift),
             options,
         }
     }

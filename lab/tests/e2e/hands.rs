@@ -38,6 +38,24 @@ fn hands_that_people_own_lift_in_simulation() {
     }
 }
 
+/// Such a hand has the name and identity of the built-in one.
+#[test]
+fn grasps_are_read_with_the_thresholds_of_the_hand_that_made_them() {
+    let folder = tempfile::tempdir().expect("a folder");
+    run(&["init", utf8(folder.path())], 0);
+    let layout = folder.path().join("hands/barrett-bh8-280.yaml");
+    let dull = read(&layout).replace("newtons: 0.05", "newtons: 2");
+    std::fs::write(layout.with_file_name("dull.yaml"), dull).expect("written");
+    let simulate = ["simulate", "--hand", "hands/dull.yaml", "--grasps", "20", "--seed", "1", "--out", "dull.mcap"];
+    run_in(folder.path(), &simulate, 0);
+    let felt = |more: &[&str]| {
+        let (said, _) = run_in(folder.path(), &[&["info", "dull.mcap"], more].concat(), 0);
+        said.lines().find(|line| line.starts_with("without contact")).expect("a line").to_owned()
+    };
+    assert_eq!(felt(&[]), felt(&["--hand", "hands/dull.yaml"]));
+    assert_ne!(felt(&[]), felt(&["--hand", "barrett-bh8-280"]));
+}
+
 #[test]
 fn planned_lifts_are_felt_more_often_than_blind_ones() {
     let folder = tempfile::tempdir().expect("a folder");

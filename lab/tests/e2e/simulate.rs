@@ -158,7 +158,7 @@ fn options_show_the_label() {
     assert!(printed(&[]).contains("label: wrench-space"));
     assert!(printed(&["--label", "wrench-space"]).contains("label: wrench-space"));
     let lift = printed(&["--label", "lift"]);
-    assert_eq!(lift.matches("label:").count(), 1, "{lift}");
+    assert_eq!((lift.matches("label:").count(), lift.matches("friction_factor:").count()), (1, 1), "{lift}");
     let folder = tempfile::tempdir().expect("a folder");
     let options = folder.path().join("options.yaml");
     std::fs::write(&options, &lift).expect("written");

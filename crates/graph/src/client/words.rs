@@ -28,15 +28,20 @@ pub fn peer_state_word(state: PeerState) -> &'static str {
 /// The troubles of a graph, in words.
 pub fn warnings(status: &GraphStatus) -> Vec<String> {
     let mut warnings: Vec<String> = status.message.iter().cloned().collect();
+    let failed: Vec<&str> =
+        status.nodes.iter().filter(|node| node.state == NodeState::Failed).map(|node| node.node.as_str()).collect();
     if status.state == GraphState::Degraded {
-        let failed: Vec<&str> =
-            status.nodes.iter().filter(|node| node.state == NodeState::Failed).map(|node| node.node.as_str()).collect();
         let which = if failed.is_empty() { "an operator".into() } else { failed.join(", ") };
         warnings.push(format!("grasps are not decided without {which}: swap it (blindgrasp swap) or stop the graph"));
     }
-    for EdgeStatus { policy, dropped, from, to, .. } in &status.edges {
+    for EdgeStatus { policy, dropped, from, to, capacity, .. } in &status.edges {
+        let has_failed = to.split_once('/').is_some_and(|(node, _)| failed.contains(&node));
         if *policy == EdgePolicy::Lossless && *dropped > 0 {
-            warnings.push(format!("{dropped} samples were lost between {from} and {to}, whose edge is lossless"));
+            warnings.push(if has_failed {
+                format!("{dropped} samples of {from} have not reached {to}, of which a swap takes the last {capacity}")
+            } else {
+                format!("{dropped} samples were lost between {from} and {to}, whose edge is lossless")
+            });
         }
     }
     warnings.extend(status.link.iter().flat_map(|link| &link.peers).filter_map(trouble));

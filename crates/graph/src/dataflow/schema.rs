@@ -181,7 +181,8 @@ fn node_keys() -> Value {
             "description": "The digests that files may have, by param; 'run' is the program",
             "additionalProperties": {"anyOf": [digest(), {"type": "array", "items": digest()}]},
         },
-        "sandbox": words(&["off", "on", "required"]),
+        // Programs that read YAML 1.1 take the words on and off for truths.
+        "sandbox": or_variable(json!({"enum": ["off", "on", "required", true, false]})),
         "memory_max_mib": integer(MIN_MEMORY_MIB, MAX_MEMORY_MIB),
         "restart": {"anyOf": [restart_policy(), {
             "type": "object",
@@ -193,7 +194,7 @@ fn node_keys() -> Value {
                 "backoff_ms": number(0.0, HOUR_MILLIS),
             },
         }]},
-        "heartbeat_ms": {"anyOf": [number(MIN_HEARTBEAT_MILLIS, HOUR_MILLIS), {"const": "off"}]},
+        "heartbeat_ms": {"anyOf": [number(MIN_HEARTBEAT_MILLIS, HOUR_MILLIS), {"enum": ["off", false]}]},
         "group": described(name_schema(), "Nodes of the same group share a process"),
         "wait": {"anyOf": [words(&["event", "poll"]), {
             "type": "object",

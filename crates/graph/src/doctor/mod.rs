@@ -245,8 +245,8 @@ fn clock_cost() -> Duration {
 fn wake_ups((normal, fifo): (Option<WakeUps>, Option<WakeUps>)) -> [Finding; 2] {
     let normal = match normal {
         Some(measured) if measured.idle.p99_us > LATE_WAKE_US => {
-            let advice = "something else keeps the cores busy: a replay may need a larger max_age_ms of the lift_arbiter, a \
-                          robot a quieter machine";
+            let advice = "something else keeps the cores busy: `run` with a recording may need a larger max_age_ms of the \
+                          lift_arbiter, a robot a quieter machine";
             Finding { verdict: Fitness::Warning, ..real_time::wake_ups(NORMAL, normal, "").with_advice(advice) }
         }
         _ => real_time::wake_ups(

@@ -349,14 +349,15 @@ impl<S: Surroundings> Lifecycle<S> {
         if swap.request.allow_mismatch {
             return None;
         }
+        let in_shadow = swap.request.shadow_limit_millis > 0;
         for target in &swap.targets {
             let identity = self.members[target.idx].standby.as_ref()?.identity.as_ref()?;
             for (idx, member) in self.members.iter().enumerate() {
-                let is_swapped = swap.targets.iter().any(|target| target.idx == idx);
-                let process = if is_swapped { &member.standby } else { &member.active };
                 let is_itself = idx == target.idx;
-                let other = if is_itself { &member.active } else { process };
-                let other = other.as_ref().and_then(|process| process.identity.as_ref());
+                let is_replaced = !is_itself && swap.targets.iter().any(|target| target.idx == idx);
+                // In the shadow, the replacement reads the running operators.
+                let process = if is_replaced && !in_shadow { &member.standby } else { &member.active };
+                let other = process.as_ref().and_then(|process| process.identity.as_ref());
                 for (key, value) in identity {
                     let theirs = other.and_then(|other| other.get(key)).filter(|theirs| *theirs != value);
                     // Only the hand must agree with its predecessor's: a new dictionary may be the reason of the swap.
@@ -365,9 +366,15 @@ impl<S: Surroundings> Lifecycle<S> {
                     {
                         let whose =
                             if is_itself { "the running one".into() } else { format!("node '{}'", member.node.id) };
+                        let advice = if is_replaced {
+                            "In the shadow it reads the running nodes: compare models by `blindgrasp view --shadow MODEL`, and \
+                             swap without --shadow"
+                        } else {
+                            "Swap the nodes together (blindgrasp swap A B --set …)"
+                        };
                         return Some(format!(
                             "the replacement of '{}' is made for the {key} {value}, {whose} for {theirs}: the arbiter would \
-                             hold every grasp. Swap the nodes together (blindgrasp swap A B --set …), or say --allow-mismatch",
+                             hold every grasp. {advice}, or say --allow-mismatch",
                             target.node.id
                         ));
                     }

@@ -18,7 +18,7 @@ use blindgrasp_messages::score::Evaluation;
 use blindgrasp_messages::{Action, GraspTruth, LiftDecision, LiftOutcome, Stamped};
 use blindgrasp_operator::wiring::InputCounts;
 
-/// This many decisions wait for the truth of their grasp.
+/// This many decisions wait for the truth of their grasp, or for a drop after that.
 const MAX_AWAITING_TRUTH: usize = 1024;
 /// The status of the graph tells this many of the latest decisions.
 const N_SHOWN: usize = 32;
@@ -39,8 +39,8 @@ pub(super) struct RunLog<S> {
     n_undecided: usize,
     /// Truths whose decision has not come.
     truths: BTreeMap<u64, GraspTruth>,
-    /// Decisions whose truth has not come.
-    decisions: BTreeMap<u64, LiftDecision>,
+    /// The latest decisions, each with its truth if that has come.
+    decisions: BTreeMap<u64, (LiftDecision, Option<GraspTruth>)>,
     /// Outcomes of grasps whose decision has not been read.
     outcomes: BTreeMap<u64, LiftOutcome>,
     /// The grasp that was decided last.
@@ -110,14 +110,13 @@ impl<S: RunSink> RunLog<S> {
     }
 
     fn on_truth(&mut self, truth: GraspTruth) {
-        match self.decisions.remove(&truth.grasp_id) {
-            Some(decision) => {
-                self.show_truth(&truth, None);
-                self.evaluation.add(&decision, Some(&truth));
-            }
-            // An object that was kept may be dropped after that.
-            None if !truth.stable && self.show_truth(&truth, Some(true)) => {}
-            None => drop(self.truths.insert(truth.grasp_id, truth)),
+        let before = self.decisions.get(&truth.grasp_id).map(|(_, known)| known.as_ref().map(|known| known.stable));
+        // An object that was kept may be dropped after that.
+        let is_news = before == Some(None) || before == Some(Some(true)) && !truth.stable;
+        let is_shown = before.is_some_and(|before| is_news && self.show_truth(&truth, before));
+        match self.decisions.get_mut(&truth.grasp_id) {
+            Some((_, known)) if is_shown || known.is_none() => *known = Some(truth),
+            _ => drop(self.truths.insert(truth.grasp_id, truth)),
         }
         // A decision comes soon after its truth: the oldest truths will have none.
         while self.truths.len() > MAX_AWAITING_DECISION && self.truths.pop_first().is_some() {
@@ -164,16 +163,14 @@ impl<S: RunSink> RunLog<S> {
         }
         self.n_decisions += 1;
         self.n_lift += usize::from(message.action == Action::Lift);
-        if truth.is_some() {
-            self.evaluation.add(message, truth.as_ref());
-            return Ok(());
+        if let Some((decision, truth)) = self.decisions.insert(message.grasp_id, (message.clone(), truth)) {
+            self.evaluation.add(&decision, truth.as_ref());
         }
-        self.decisions.insert(message.grasp_id, message.clone());
         // A truth comes before its decision or right after it: the oldest decisions will have none.
         while self.decisions.len() > MAX_AWAITING_TRUTH
-            && let Some((_, decision)) = self.decisions.pop_first()
+            && let Some((_, (decision, truth))) = self.decisions.pop_first()
         {
-            self.evaluation.add(&decision, None);
+            self.evaluation.add(&decision, truth.as_ref());
         }
         Ok(())
     }
@@ -184,8 +181,8 @@ impl<S: RunSink> RunLog<S> {
         ran: &Ran<'_>,
         observed: &BTreeMap<String, InputCounts>,
     ) -> anyhow::Result<(RunSummary, S)> {
-        for decision in self.decisions.values() {
-            self.evaluation.add(decision, None);
+        for (decision, truth) in self.decisions.values() {
+            self.evaluation.add(decision, truth.as_ref());
         }
         for outcome in self.outcomes.values() {
             self.sink.outcome(outcome)?;

@@ -174,7 +174,7 @@ with_defaults! {
 }
 
 impl LiftOptions {
-    fn is_default(&self) -> bool {
+    pub fn is_default(&self) -> bool {
         *self == LiftOptions::default()
     }
 

@@ -303,6 +303,9 @@ fn a_nodes_process_options_are_read_and_wrong_ones_refused() {
     let errors = |nodes: &str| Folder::new().errors(format!("version: 1\nname: g\noperators:\n{nodes}").as_bytes());
     let node = filter_with("sandbox: off");
     assert_eq!(node.process, ProcessOptions::default());
+    // As programs write it that take the word on for a truth.
+    assert_eq!(filter_with("sandbox: true").sandbox, filter_with("sandbox: on").sandbox);
+    assert_eq!(filter_with("heartbeat_ms: false").heartbeat_millis, None);
     for (given, wait) in [("wait: event", WaitMode::Event), ("wait: {poll_us: 50}", WaitMode::PollMicros(50))] {
         assert_eq!(filter_with(given).process.wait, wait);
     }
