@@ -44,7 +44,7 @@ font-size:12px;font-variant-numeric:tabular-nums}.title{font-size:15px;font-weig
 /// # Errors
 /// Joint angles that are not the hand's.
 pub fn dictionary_svg(hand: &Hand, joints: &[f64], words: &[DrawnWord]) -> Result<String, PictureError> {
-    let poses = hand.palm_from_links(joints).map_err(|source| PictureError::Joints { grasp_id: 0, source })?;
+    let poses = hand.palm_from_links(joints)?;
     let mut links: Vec<Mesh> = hand.links.iter().map(link_mesh).collect();
     for (link, palm_from_link) in links.iter_mut().zip(&poses) {
         link.transform(palm_from_link);

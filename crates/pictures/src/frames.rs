@@ -57,8 +57,7 @@ impl DrawnFrames {
             let frame = &all[*idx];
             let since_start_nanos = frame.header.stamp_nanos.saturating_sub(all[0].header.stamp_nanos);
             let title = format!("{}, {:.0} ms", frame.message.phase.as_str(), since_start_nanos as f64 / 1e6);
-            let poses = placed.hand.palm_from_links(&frame.message.joints);
-            let poses = poses.map_err(|source| PictureError::Joints { grasp_id: placed.grasp.grasp_id, source })?;
+            let poses = placed.hand.palm_from_links(&frame.message.joints)?;
             let cells = frame.message.cells_newtons.iter();
             drawn.frames.push(DrawnFrame {
                 title,
@@ -88,10 +87,8 @@ impl DrawnFrames {
         let mut drawn = DrawnFrames { scene, frames: Vec::new(), scale_newtons: 1.0 };
         for (thing_idx, (_, moments)) in things.iter().enumerate() {
             for moment in *moments {
-                let palm_from_links = hand.palm_from_links(&moment.joints);
-                let palm_from_links = palm_from_links.map_err(|source| PictureError::Joints { grasp_id: 0, source })?;
                 let mut links = Vec::new();
-                for palm_from_link in palm_from_links {
+                for palm_from_link in hand.palm_from_links(&moment.joints)? {
                     links.push(Some(rows(&(moment.world_from_palm * palm_from_link))));
                 }
                 links.push(Some(rows(&Isometry3::identity())));

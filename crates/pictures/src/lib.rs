@@ -54,19 +54,13 @@ use blindgrasp_stages::hand::JointError;
 /// Why there is no picture.
 #[derive(Debug, thiserror::Error)]
 pub enum PictureError {
-    /// Nothing was recorded of the grasp.
-    #[error("grasp {grasp_id} has no frames: expected at least one")]
-    NoFrames { grasp_id: u64 },
-    /// The frames are not the hand's.
-    #[error("grasp {grasp_id}, frame {idx}: {found} cells, the hand has {expected}")]
-    Cells { grasp_id: u64, idx: usize, found: usize, expected: usize },
     /// The joint angles are not the hand's.
-    #[error("grasp {grasp_id}")]
-    Joints { grasp_id: u64, source: JointError },
-    /// The scene names a link that the hand doesn't have.
-    #[error("grasp {grasp_id}: a contact of link {found}, the hand has the links 0 to {}", n_links - 1)]
-    Link { grasp_id: u64, found: i64, n_links: usize },
+    #[error(transparent)]
+    Joints(#[from] JointError),
+    /// The frames or the scene are not the hand's, or nothing was recorded of the grasp.
+    #[error("grasp {grasp_id}{why}")]
+    Grasp { grasp_id: u64, why: String },
     /// The page's data could not be written as JSON.
     #[error("could not write the page's data")]
-    Data { source: serde_json::Error },
+    Data(#[from] serde_json::Error),
 }

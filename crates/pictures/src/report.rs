@@ -49,8 +49,7 @@ pub fn report_html(
 
 /// JSON that can stand in a script of a page: a name in it does not end the script.
 fn json_for_page(data: &impl Serialize) -> Result<String, PictureError> {
-    let json = serde_json::to_string(data).map_err(|source| PictureError::Data { source })?;
-    Ok(json.replace('<', "\\u003c"))
+    Ok(serde_json::to_string(data)?.replace('<', "\\u003c"))
 }
 
 /// The modules of a page that shows a hand in three dimensions: its script loads them out of the page.

@@ -107,7 +107,14 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let out = match &arguments.out {
         Some(out) if !arguments.print_options => out,
         _ => {
-            print_text(serde_saphyr::to_string(&AllOptions::of(&options))?.trim_end())?;
+            let all = AllOptions {
+                label: (options.label == Label::default()).then_some(options.label),
+                thresholds: options.thresholds.is_default().then_some(options.thresholds),
+                // Without the label `lift` they must not be set.
+                lift: (options.label == Label::Lift && options.lift.is_default()).then_some(&options.lift),
+                options: &options,
+            };
+            print_text(serde_saphyr::to_string(&all)?.trim_end())?;
             return Ok(Outcome::Done);
         }
     };
@@ -426,18 +433,6 @@ struct AllOptions<'a> {
     lift: Option<&'a LiftOptions>,
     #[serde(flatten)]
     options: &'a SimulatorOptions,
-}
-
-impl<'a> AllOptions<'a> {
-    fn of(options: &'a SimulatorOptions) -> Self {
-        AllOptions {
-            label: (options.label == Label::default()).then_some(options.label),
-            thresholds: options.thresholds.is_default().then_some(options.thresholds),
-            // Without the label `lift` they must not be set.
-            lift: (options.label == Label::Lift && options.lift.is_default()).then_some(&options.lift),
-            options,
-        }
-    }
 }
 
 /// Writes simulated grasps to a recording, with numbers, times and headers.

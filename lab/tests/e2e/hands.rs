@@ -44,7 +44,7 @@ fn grasps_are_read_with_the_thresholds_of_the_hand_that_made_them() {
     let folder = tempfile::tempdir().expect("a folder");
     run(&["init", utf8(folder.path())], 0);
     let layout = folder.path().join("hands/barrett-bh8-280.yaml");
-    let dull = read(&layout).replace("newtons: 0.05", "newtons: 2");
+    let dull = read(utf8(&layout)).replace("newtons: 0.05", "newtons: 2");
     std::fs::write(layout.with_file_name("dull.yaml"), dull).expect("written");
     let simulate = ["simulate", "--hand", "hands/dull.yaml", "--grasps", "20", "--seed", "1", "--out", "dull.mcap"];
     run_in(folder.path(), &simulate, 0);

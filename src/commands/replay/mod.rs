@@ -13,6 +13,7 @@ pub(super) use self::feed::{Fed, Feed};
 use super::recording_arguments::RecordingArguments;
 use super::{Outcome, stop_requests};
 use blindgrasp_cli::graph_file::{OnMisfit, fitting};
+use blindgrasp_cli::secs_in;
 use blindgrasp_graph::dataflow::{self, Override};
 use blindgrasp_graph::launcher::LaunchOptions;
 use blindgrasp_operator::wiring::Clock;
@@ -114,12 +115,7 @@ fn rate(text: &str) -> Result<Value, String> {
 }
 
 fn nanos(text: &str) -> Result<u64, String> {
-    let duration = match text.parse::<f64>() {
-        Ok(secs) => Duration::try_from_secs_f64(secs).ok(),
-        Err(_) => humantime::parse_duration(text).ok(),
-    };
-    let nanos = duration.and_then(|duration| u64::try_from(duration.as_nanos()).ok());
-    nanos.ok_or_else(|| "expected seconds, like 12.5, or like 1m30s".into())
+    secs_in(text, 0.0..=1e9).map(|secs| (1e9 * secs).round() as u64)
 }
 
 #[cfg(test)]

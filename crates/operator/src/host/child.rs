@@ -7,7 +7,7 @@ use std::os::unix::process::CommandExt;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-use anyhow::Context as _;
+use anyhow::{Context as _, anyhow, bail};
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::io::FdFlags;
 use rustix::process::{Signal, getpid, getppid, set_parent_process_death_signal};
@@ -24,6 +24,9 @@ const READ_BYTES: usize = 64 << 10;
 const MAX_ASIDES: usize = 10_000;
 /// The longest text of a log line or a failure: the launcher reads lines of up to 64 KiB.
 const MAX_TEXT_BYTES: usize = 4096;
+
+/// What a pipe's error is about.
+const NO_PIPE: &str = "the pipe to its program does not work";
 
 /// A program that works for this process.
 pub(super) struct Program {
@@ -42,31 +45,6 @@ pub(super) struct Program {
 pub(super) struct Asides {
     pub(super) lines: Vec<LogEntry>,
     pub(super) counts: std::collections::BTreeMap<String, u64>,
-}
-
-/// Why a program cannot be worked with.
-#[derive(Debug, thiserror::Error)]
-pub(super) enum ProgramError {
-    #[error("{0}")]
-    Failed(String),
-    #[error("its program ended{0}, expected an answer to {1:?}")]
-    Ended(String, Ask),
-    #[error("its program ended{0} without being asked")]
-    Gone(String),
-    #[error("its program said {found}, expected {expected}")]
-    Unexpected { found: String, expected: &'static str },
-    #[error("its program wants to send {0} bytes at once, expected at most {MAX_BODY_BYTES}")]
-    TooLong(usize),
-    #[error("its program changed a head into one of {found} bytes right before it was sent, expected {expected}")]
-    CheckedHead { found: usize, expected: usize },
-    #[error("its program said {0} lines before its answer, expected at most {MAX_ASIDES}")]
-    TooManyLines(usize),
-    #[error(transparent)]
-    Work(#[from] super::protocol::WorkError),
-    #[error("its program's {0} cannot be read")]
-    Json(&'static str, #[source] serde_json::Error),
-    #[error("the pipe to its program does not work")]
-    Pipe(#[source] std::io::Error),
 }
 
 impl Program {
@@ -129,43 +107,43 @@ impl Program {
         flags: u32,
         state: &[u8],
         parts: impl Iterator<Item = (usize, &'a [u8], &'a [u8])>,
-    ) -> Result<(), ProgramError> {
+    ) -> anyhow::Result<()> {
         self.begin(ask);
         write_work(nanos, flags, state, parts, &mut self.out);
         self.send(ask)
     }
 
     /// Sends a message with a body of JSON.
-    pub(super) fn ask_json(&mut self, ask: Ask, body: &impl serde::Serialize) -> Result<(), ProgramError> {
+    pub(super) fn ask_json(&mut self, ask: Ask, body: &impl serde::Serialize) -> anyhow::Result<()> {
         self.begin(ask);
-        serde_json::to_writer(&mut self.out, body).map_err(|error| ProgramError::Json("message", error))?;
+        serde_json::to_writer(&mut self.out, body).context("its program's message cannot be read")?;
         self.send(ask)
     }
 
     /// Its answer to a message about samples.
-    pub(super) fn answer(&mut self, to: Ask) -> Result<Answer, ProgramError> {
+    pub(super) fn answer(&mut self, to: Ask) -> anyhow::Result<Answer> {
         match self.next()? {
             Some((Say::Done, body)) => Ok(Answer::Done(read_work(&body)?)),
             Some((Say::OneByOne, _)) => Ok(Answer::OneByOne),
             Some((Say::Refused, body)) => Ok(Answer::Refused(String::from_utf8_lossy(&body).into_owned())),
             Some((found, _)) => Err(unexpected(found, "an answer")),
-            None => Err(ProgramError::Ended(self.end(), to)),
+            None => Err(ended(&self.end(), to)),
         }
     }
 
     /// Its answer to [`Ask::Start`].
-    pub(super) fn ready<T: serde::de::DeserializeOwned>(&mut self) -> Result<T, ProgramError> {
+    pub(super) fn ready<T: serde::de::DeserializeOwned>(&mut self) -> anyhow::Result<T> {
         match self.next()? {
             Some((Say::Ready, body)) => {
-                serde_json::from_slice(&body).map_err(|error| ProgramError::Json("answer to Start", error))
+                serde_json::from_slice(&body).context("its program's answer to Start cannot be read")
             }
             Some((found, _)) => Err(unexpected(found, "that it is ready")),
-            None => Err(ProgramError::Ended(self.end(), Ask::Start)),
+            None => Err(ended(&self.end(), Ask::Start)),
         }
     }
 
     /// The log lines and counts that have come. Call it now and then: it also finds that the program has ended.
-    pub(super) fn listen(&mut self) -> Result<Asides, ProgramError> {
+    pub(super) fn listen(&mut self) -> anyhow::Result<Asides> {
         // A program that talks without pause is heard again the next time.
         for _ in 0..MAX_ASIDES {
             if !self.has_more() {
@@ -174,7 +152,7 @@ impl Program {
             match self.next_frame()? {
                 Some((kind @ (Say::Log | Say::Counts | Say::Failed), body)) => self.take_in(kind, &body)?,
                 Some((found, _)) => return Err(unexpected(found, "nothing, because it was not asked")),
-                None => return Err(ProgramError::Gone(self.end())),
+                None => bail!("its program ended{} without being asked", self.end()),
             }
         }
         Ok(std::mem::take(&mut self.asides))
@@ -200,40 +178,40 @@ impl Program {
         self.out.extend_from_slice(&(ask as u32).to_ne_bytes());
     }
 
-    fn send(&mut self, ask: Ask) -> Result<(), ProgramError> {
+    fn send(&mut self, ask: Ask) -> anyhow::Result<()> {
         let n_body = self.out.len() - FRAME_BYTES;
         self.out[..4].copy_from_slice(&(n_body as u32).to_ne_bytes());
-        let Some(to) = &mut self.to else { return Err(ProgramError::Ended(String::new(), ask)) };
+        let Some(to) = &mut self.to else { return Err(ended("", ask)) };
         match to.write_all(&self.out) {
             Err(error) if error.kind() == std::io::ErrorKind::BrokenPipe => Err(self.reason_of_end(ask)),
-            outcome => outcome.map_err(ProgramError::Pipe),
+            outcome => outcome.context(NO_PIPE),
         }
     }
 
     /// Why a program does not listen any more: what it said before it ended, if it said something.
-    fn reason_of_end(&mut self, ask: Ask) -> ProgramError {
+    fn reason_of_end(&mut self, ask: Ask) -> anyhow::Error {
         match self.next() {
             Err(error) => error,
-            Ok(_) => ProgramError::Ended(self.end(), ask),
+            Ok(_) => ended(&self.end(), ask),
         }
     }
 
     /// Its next message that is an answer; `None` if it has ended.
-    fn next(&mut self) -> Result<Option<(Say, Vec<u8>)>, ProgramError> {
+    fn next(&mut self) -> anyhow::Result<Option<(Say, Vec<u8>)>> {
         for _ in 0..MAX_ASIDES {
             match self.next_frame()? {
                 Some((kind @ (Say::Log | Say::Counts | Say::Failed), body)) => self.take_in(kind, &body)?,
                 frame => return Ok(frame),
             }
         }
-        Err(ProgramError::TooManyLines(MAX_ASIDES + 1))
+        bail!("its program said {} lines before its answer, expected at most {MAX_ASIDES}", MAX_ASIDES + 1)
     }
 
-    fn take_in(&mut self, kind: Say, body: &[u8]) -> Result<(), ProgramError> {
+    fn take_in(&mut self, kind: Say, body: &[u8]) -> anyhow::Result<()> {
         match kind {
             Say::Log => {
                 let mut line: LogEntry =
-                    serde_json::from_slice(body).map_err(|error| ProgramError::Json("log line", error))?;
+                    serde_json::from_slice(body).context("its program's log line cannot be read")?;
                 line.text = shortened(&line.text);
                 if serde_json::to_string(&line.fields).is_ok_and(|fields| fields.len() > MAX_TEXT_BYTES) {
                     line.fields = LogEntry::plain("").fields;
@@ -243,36 +221,34 @@ impl Program {
             }
             Say::Counts => {
                 let counts: std::collections::BTreeMap<String, u64> =
-                    serde_json::from_slice(body).map_err(|error| ProgramError::Json("counts", error))?;
+                    serde_json::from_slice(body).context("its program's counts cannot be read")?;
                 self.asides.counts.extend(counts);
             }
-            _ => return Err(ProgramError::Failed(shortened(&String::from_utf8_lossy(body)))),
+            _ => bail!(shortened(&String::from_utf8_lossy(body))),
         }
         Ok(())
     }
 
-    fn next_frame(&mut self) -> Result<Option<(Say, Vec<u8>)>, ProgramError> {
+    fn next_frame(&mut self) -> anyhow::Result<Option<(Say, Vec<u8>)>> {
         loop {
             let rest = &self.read[self.used..];
             if rest.len() >= FRAME_BYTES {
                 let (n_body, kind) = (number(rest, 0) as usize, number(rest, 4) as u32);
                 if n_body > MAX_BODY_BYTES {
-                    return Err(ProgramError::TooLong(n_body));
+                    bail!("its program wants to send {n_body} bytes at once, expected at most {MAX_BODY_BYTES}");
                 }
                 if rest.len() >= FRAME_BYTES + n_body {
                     let body = rest[FRAME_BYTES..FRAME_BYTES + n_body].to_vec();
                     self.used += FRAME_BYTES + n_body;
                     let Some(say) = Say::of(kind) else {
-                        let found = format!("a message of the unknown kind {kind}");
-                        return Err(ProgramError::Unexpected { found, expected: "one from 1 to 7" });
+                        bail!("its program said a message of the unknown kind {kind}, expected one from 1 to 7");
                     };
                     return Ok(Some((say, body)));
                 }
             }
-            if !self.read_more().map_err(ProgramError::Pipe)? {
+            if !self.read_more().context(NO_PIPE)? {
                 if self.used < self.read.len() {
-                    let found = format!("a part of a message, and ended{}", self.end());
-                    return Err(ProgramError::Unexpected { found, expected: "a whole message" });
+                    bail!("its program said a part of a message, and ended{}, expected a whole message", self.end());
                 }
                 return Ok(None);
             }
@@ -318,11 +294,11 @@ pub(super) enum Answer {
 
 impl Answer {
     /// The answer to a message that a program can neither refuse nor divide.
-    pub(super) fn done(self) -> Result<Work, ProgramError> {
+    pub(super) fn done(self) -> anyhow::Result<Work> {
         match self {
             Answer::Done(work) => Ok(work),
             Answer::OneByOne => Err(unexpected(Say::OneByOne, "an answer")),
-            Answer::Refused(reason) => Err(ProgramError::Failed(reason)),
+            Answer::Refused(reason) => bail!(reason),
         }
     }
 }
@@ -335,8 +311,12 @@ fn shortened(text: &str) -> String {
     format!("{} …", &text[..text.floor_char_boundary(MAX_TEXT_BYTES)])
 }
 
-fn unexpected(found: Say, expected: &'static str) -> ProgramError {
-    ProgramError::Unexpected { found: format!("{found:?}"), expected }
+fn unexpected(found: Say, expected: &'static str) -> anyhow::Error {
+    anyhow!("its program said {found:?}, expected {expected}")
+}
+
+fn ended(how: &str, to: Ask) -> anyhow::Error {
+    anyhow!("its program ended{how}, expected an answer to {to:?}")
 }
 
 impl Drop for Program {

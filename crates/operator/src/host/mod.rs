@@ -24,7 +24,7 @@ use crate::operator::{self, Operator, name_process};
 use crate::sandbox::Sandbox;
 use crate::wiring::{self, Enforcement, LogEntry, WIRING_VARIABLE, Wiring};
 use crate::{monotonic_nanos, reports, sandbox};
-use child::{Answer, Asides, Program, ProgramError};
+use child::{Answer, Asides, Program};
 use protocol::{Ask, HAS_STATE, Ready, Start, VERSION, Work};
 
 /// The program of this process, if it is a host.
@@ -108,7 +108,7 @@ fn start(operator: &Operator, description: &OperatorDescription, child: &mut Pro
 }
 
 /// Gives the program new values of its live parameters; the inner error is its reason to refuse them.
-fn set(child: &mut Program, params: &Map<String, Value>) -> Result<Result<(), String>, ProgramError> {
+fn set(child: &mut Program, params: &Map<String, Value>) -> anyhow::Result<Result<(), String>> {
     child.ask_json(Ask::Set, params)?;
     match child.answer(Ask::Set)? {
         Answer::Refused(reason) => Ok(Err(reason)),
@@ -117,7 +117,7 @@ fn set(child: &mut Program, params: &Map<String, Value>) -> Result<Result<(), St
 }
 
 /// Gives the program a state, or lets it begin anew.
-fn restore(child: &mut Program, state: Option<&[u8]>) -> Result<Work, ProgramError> {
+fn restore(child: &mut Program, state: Option<&[u8]>) -> anyhow::Result<Work> {
     let flags = if state.is_some() { HAS_STATE } else { 0 };
     child.ask(Ask::Restore, monotonic_nanos(), flags, state.unwrap_or_default(), std::iter::empty())?;
     child.answer(Ask::Restore)?.done()
@@ -172,7 +172,7 @@ fn log(operator: &Operator, lines: Vec<LogEntry>) {
 }
 
 /// Listens to a program that has nothing to do, some times a second: it may have said something, or ended.
-fn listen(operator: &Operator, child: &mut Program) -> Result<(), ProgramError> {
+fn listen(operator: &Operator, child: &mut Program) -> anyhow::Result<()> {
     let Asides { lines, counts } = child.listen()?;
     log(operator, lines);
     if !counts.is_empty() {

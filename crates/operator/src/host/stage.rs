@@ -181,7 +181,7 @@ impl ProgramWorker {
             let (head, items) = sample.parts();
             (*port, head, items)
         });
-        Ok(self.child.ask(Ask::Sample, taken.arrival_nanos, flags, &[], own.chain(others))?)
+        self.child.ask(Ask::Sample, taken.arrival_nanos, flags, &[], own.chain(others))
     }
 
     /// The head that the program wants to send, if it changes one right before it is sent.
@@ -195,7 +195,9 @@ impl ProgramWorker {
         let Some(part) = work.parts.into_iter().next() else { return Ok(None) };
         let (found, expected) = (part.head.len(), head.len());
         if found != expected {
-            return Err(child::ProgramError::CheckedHead { found, expected }.into());
+            anyhow::bail!(
+                "its program changed a head into one of {found} bytes right before it was sent, expected {expected}"
+            );
         }
         Ok(Some(with_header(part.head, &header_of(head))))
     }
@@ -304,7 +306,7 @@ impl Worker<UntypedSample> for ProgramWorker {
     }
 
     fn look(&mut self) -> anyhow::Result<()> {
-        Ok(listen(&self.operator, &mut self.child)?)
+        listen(&self.operator, &mut self.child)
     }
 
     fn has_had_turn(&mut self) {

@@ -29,30 +29,19 @@ pub use sample::PortSample;
 pub(crate) use sample::UntypedSample;
 pub use subscriber::{Subscriber, UntypedSubscriber};
 
-/// Why a port does not work. The sources are errors of iceoryx2.
+/// Why a port does not work, perhaps with an error of iceoryx2.
 #[derive(Debug, thiserror::Error)]
-pub enum PortError {
-    #[error("port {service} carries {found}, expected {expected}")]
-    WrongType { service: String, found: String, expected: &'static str },
-    #[error("port {service}: a sample has not the lengths of {expected}: its writer was built with another version")]
-    WrongLength { service: String, expected: &'static str },
-    #[error("port {service} cannot be opened")]
-    Open { service: String, source: BoxedError },
-    #[error("port {service} cannot be connected")]
-    Connect { service: String, source: BoxedError },
-    #[error("sample {seq} of port {service} cannot be sent")]
-    Send { service: String, seq: u64, source: BoxedError },
-    #[error(
-        "sample {seq} of port {service} could not be delivered within {limit_millis} ms: a reader is stopped or too slow"
-    )]
-    Stalled { service: String, seq: u64, limit_millis: u128 },
-    #[error(
-        "the readers of port {service} lack samples up to {seq}, which ended with the instance that has handed over: this one \
-         begins again after their last sample"
-    )]
-    PredecessorGone { service: String, seq: u64 },
-    #[error("port {service} cannot receive")]
-    Receive { service: String, source: BoxedError },
+#[error("port {service} {what}")]
+pub struct PortError {
+    service: String,
+    what: String,
+    source: Option<BoxedError>,
+}
+
+impl PortError {
+    fn new(service: &str, what: impl Into<String>, source: Option<BoxedError>) -> PortError {
+        PortError { service: service.into(), what: what.into(), source }
+    }
 }
 
 /// An error of iceoryx2.

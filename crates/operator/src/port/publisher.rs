@@ -105,7 +105,7 @@ impl Sender {
     }
 
     fn send(&self, seq: u64, parts: &Parts<'_>) -> Result<(), PortError> {
-        let failed = |source| PortError::Send { service: self.service.clone(), seq, source };
+        let failed = |source| PortError::new(&self.service, format!("cannot send sample {seq}"), Some(source));
         let mut sample = self.publisher.loan_slice(parts.n_words()).map_err(|error| failed(error.into()))?;
         *sample.user_header_mut() = parts.envelope();
         parts.write(sample.payload_mut());
@@ -122,7 +122,7 @@ impl Sender {
     /// Gives the history to readers that have come since the last sample, and wakes them.
     fn look_for_readers(&mut self) -> Result<(), PortError> {
         let n_subscribers = self.pub_sub.dynamic_config().number_of_subscribers();
-        let failed = |source| PortError::Connect { service: self.service.clone(), source };
+        let failed = |source| PortError::new(&self.service, "cannot be connected", Some(source));
         self.publisher.update_connections().map_err(|error| failed(error.into()))?;
         let (pub_sub, publisher) = (&self.pub_sub, &self.publisher);
         let mended = self.connections.mend(|| {
@@ -331,7 +331,13 @@ impl UntypedPublisher {
         self.sender.look_for_readers()?;
         let n_publishers = self.sender.pub_sub.dynamic_config().number_of_publishers();
         match self.credit.lost_predecessor(&*self.sender.cursors, self.written(), n_publishers) {
-            Some(SampleId { seq, .. }) => Err(PortError::PredecessorGone { service: self.sender.service.clone(), seq }),
+            Some(SampleId { seq, .. }) => {
+                let what = format!(
+                    "has readers that lack samples up to {seq}, which ended with the instance that has handed over: this one \
+                     begins again after their last sample"
+                );
+                Err(PortError::new(&self.sender.service, what, None))
+            }
             None => Ok(()),
         }
     }
@@ -466,11 +472,10 @@ impl UntypedPublisher {
             let now = Instant::now();
             waited += now.duration_since(std::mem::replace(&mut last_try, now)).min(LONGEST_TRY);
             if start.elapsed() > self.wait_limit {
-                break Err(PortError::Stalled {
-                    service: self.sender.service.clone(),
-                    seq: key.seq,
-                    limit_millis: self.wait_limit.as_millis(),
-                });
+                let (seq, millis) = (key.seq, self.wait_limit.as_millis());
+                let what =
+                    format!("could not deliver sample {seq} within {millis} ms: a reader is stopped or too slow");
+                break Err(PortError::new(&self.sender.service, what, None));
             }
             if last_look.elapsed() > LOOK_PAUSE {
                 last_look = Instant::now();

@@ -26,8 +26,8 @@ pub(super) fn pub_sub(
     type_name: &'static str,
 ) -> Result<PubSub, PortError> {
     if wiring.type_name != type_name {
-        let (service, found) = (wiring.name.clone(), wiring.type_name.clone());
-        return Err(PortError::WrongType { service, found, expected: type_name });
+        let what = format!("carries {}, expected {type_name}", wiring.type_name);
+        return Err(PortError::new(&wiring.name, what, None));
     }
     let name = service_name(wiring)?;
     let opened = open_with_retries(|| {
@@ -128,7 +128,7 @@ fn service_name(wiring: &ServiceWiring) -> Result<ServiceName, PortError> {
 }
 
 pub(super) fn open_failed(wiring: &ServiceWiring, source: impl Into<BoxedError>) -> PortError {
-    PortError::Open { service: wiring.name.clone(), source: source.into() }
+    PortError::new(&wiring.name, "cannot be opened", Some(source.into()))
 }
 
 #[cfg(test)]

@@ -165,7 +165,7 @@ impl UntypedSubscriber {
     /// # Errors
     /// An error of iceoryx2, or a connection could not be made again and again.
     pub fn connect(&mut self) -> Result<bool, PortError> {
-        let failed = |service: &str, source| PortError::Connect { service: service.into(), source };
+        let failed = |service: &str, source| PortError::new(service, "cannot be connected", Some(source));
         self.subscriber.update_connections().map_err(|error| failed(&self.service, error.into()))?;
         let (pub_sub, buffer_size, handler) = (&self.pub_sub, self.buffer_size, self.connections.handler());
         let (subscriber, sequencer) = (&mut self.subscriber, &mut self.sequencer);
@@ -280,9 +280,8 @@ impl UntypedSubscriber {
             return Ok(Some(self.delivered(sample)));
         }
         loop {
-            let sample = self.subscriber.receive();
-            let sample =
-                sample.map_err(|error| PortError::Receive { service: self.service.clone(), source: error.into() })?;
+            let failed = |source| PortError::new(&self.service, "cannot receive", Some(source));
+            let sample = self.subscriber.receive().map_err(|error| failed(error.into()))?;
             let Some(sample) = sample else {
                 // Only now, because the samples that a held one waits for may have been in the queue.
                 let overdue =
@@ -291,9 +290,12 @@ impl UntypedSubscriber {
             };
             let publisher = sample.header().publisher_id().value();
             let may_reorder = || self.pub_sub.dynamic_config().number_of_publishers() > 1;
-            let sample = UntypedSample::lent(sample, &self.layout).ok_or_else(|| PortError::WrongLength {
-                service: self.service.clone(),
-                expected: self.layout.type_name,
+            let sample = UntypedSample::lent(sample, &self.layout).ok_or_else(|| {
+                let expected = self.layout.type_name;
+                let what = format!(
+                    "has a sample without the lengths of {expected}: its writer was built with another version"
+                );
+                PortError::new(&self.service, what, None)
             })?;
             let key = sample.key();
             let written = self.cursors.as_ref().and_then(|(cursors, _)| cursors.output(self.writer_slot).written());

@@ -346,22 +346,15 @@ pub struct BareHand {
 pub enum HandError {
     #[error("cannot read {}", path.display())]
     Read { path: PathBuf, source: std::io::Error },
-    /// The file is invalid.
+    /// The file is invalid: the problem, and the file's expected content.
     #[error("{}: {message}", path.display())]
-    Invalid {
-        path: PathBuf,
-        /// The problem and what was expected.
-        message: String,
-    },
+    Invalid { path: PathBuf, message: String },
     /// Neither a file nor the name of a built-in hand.
     #[error(
         "no hand '{name}': expected a pad layout (a .yaml file that names its URDF) or a built-in hand ({})",
         builtin_names().join(", ")
     )]
-    Unknown {
-        /// The name that was given.
-        name: String,
-    },
+    Unknown { name: String },
 }
 
 /// Name, pad layout and URDF of a hand of the folder `hands`.
