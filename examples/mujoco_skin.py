@@ -12,7 +12,7 @@ from pathlib import Path
 import blindgrasp
 import mujoco
 
-hands = Path(__file__).resolve().parent.parent / "hands"
+hands = Path(globals().get("__file__", "mujoco_skin.py")).resolve().parent.parent / "hands"
 spec = mujoco.MjSpec.from_file(str(hands / "parallel-gripper.urdf"))
 # Links without a joint stay bodies, which cells can lie on.
 spec.compiler.fusestatic = False

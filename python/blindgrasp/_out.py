@@ -528,7 +528,8 @@ def _both(one: dict[str, Any], other: dict[str, Any]) -> dict[str, Any]:
 
 
 def _statistics(sums: dict[str, Any], n_frames: int) -> dict[str, Any]:
-    n = np.maximum(sums["n"], 1)
+    # NaN of a value that nothing was read of.
+    n = np.where(sums["n"] > 0, sums["n"], np.nan)
     mean = sums["sum"] / n
     std = np.sqrt(np.maximum(sums["squares"] / n - mean**2, 0.0))
     found = {"min": sums["min"], "max": sums["max"], "mean": mean, "std": std}

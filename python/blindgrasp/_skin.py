@@ -141,8 +141,10 @@ class Skin:
         """The forces on the cells, newtons: what `read` gives without any of the options but the bell's."""
         places, n_cells = self._places, len(self.names)
         contact = data.contact
-        newtons = places.newtons(contact, data.efc_force)
         parts = places.part_of_geom.take(contact.geom, mode="wrap")
+        if parts.max(initial=-1) < 0:
+            return np.zeros(n_cells)
+        newtons = places.newtons(contact, data.efc_force)
         parts[newtons <= 0.0] = -1
         pressed = (parts.ravel() >= 0).nonzero()[0]
         if not len(pressed):

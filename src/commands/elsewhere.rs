@@ -6,6 +6,7 @@
 //! ssh without a terminal passes no signals on. So the command there reads its stdin: a line [`STOP`] is Ctrl-C, and the
 //! end of stdin means that the caller has gone, which stops the command as well.
 
+use std::collections::BTreeSet;
 use std::ffi::{OsStr, OsString};
 use std::io::{BufRead, IsTerminal, Write};
 use std::os::unix::ffi::OsStrExt;
@@ -219,17 +220,17 @@ fn stop_self() {
 
 /// The destination that the dataflow files of the graphs here name for a machine, or its name.
 fn host_of(machine: &str) -> anyhow::Result<String> {
-    let mut hosts: Vec<String> = Vec::new();
+    let mut hosts = BTreeSet::new();
     for graph in running_graphs() {
-        let named = status(&graph).ok().and_then(|status| status.ssh_hosts.get(machine).cloned());
-        hosts.extend(named);
+        if let Ok(status) = status(&graph) {
+            hosts.extend(status.ssh_hosts.get(machine).cloned());
+        }
     }
-    hosts.sort_unstable();
-    hosts.dedup();
     if hosts.len() > 1 {
-        bail!("the graphs here name several destinations for machine '{machine}' ({}): give --ssh", hosts.join(", "));
+        let hosts = Vec::from_iter(hosts).join(", ");
+        bail!("the graphs here name several destinations for machine '{machine}' ({hosts}): give --ssh");
     }
-    Ok(hosts.pop().unwrap_or_else(|| machine.to_owned()))
+    Ok(hosts.pop_first().unwrap_or_else(|| machine.to_owned()))
 }
 
 fn is_on_path(program: &str) -> bool {

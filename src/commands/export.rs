@@ -48,7 +48,7 @@ pub(super) struct Arguments {
     /// With --features, take only every N-th recording, from the I-th on (0/N to N-1/N).
     #[arg(long, value_name = "I/N", requires = "features")]
     shard: Option<Shard>,
-    /// Pad layout of the hand, for --features; default: the built-in hand that the first recording names.
+    /// Pad layout of the hand, for --features; default: that of the first recording, if its name is a built-in one.
     #[arg(long, requires = "features", add = completions::hands())]
     hand: Option<PathBuf>,
 }

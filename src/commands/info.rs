@@ -33,7 +33,7 @@ pub(super) struct Arguments {
     /// Recordings (MCAP) or folders of them; or one pad layout: a YAML file, or the name of a built-in hand
     #[arg(required = true, add = completions::hands())]
     recordings: Vec<PathBuf>,
-    /// Pad layout of the hand; default: the built-in hand that the first recording names.
+    /// Pad layout of the hand; default: that of the first recording, if its name is a built-in one.
     #[arg(long, add = completions::hands())]
     hand: Option<PathBuf>,
     /// Read all of it, however large, and sum up the grasps.

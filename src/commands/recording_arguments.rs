@@ -16,8 +16,8 @@ pub(super) struct RecordingArguments {
     #[arg(long, value_name = "SIZE", value_parser = bytes)]
     rotate_size: Option<u64>,
     /// Begin another file after this time (90s, 10m, 1h)
-    #[arg(long, value_name = "TIME", value_parser = |text: &str| secs_in(text, 0.1..=1e8))]
-    rotate_every: Option<f64>,
+    #[arg(long, value_name = "TIME", value_parser = |text: &str| secs_in(text, 0.1..=1e8).map(Duration::from_secs_f64))]
+    rotate_every: Option<Duration>,
     /// Replace existing files
     #[arg(long)]
     overwrite: bool,
@@ -26,8 +26,7 @@ pub(super) struct RecordingArguments {
 impl RecordingArguments {
     pub(super) fn options(&self) -> LiveOptions {
         let RecordingArguments { rotate_size, rotate_every, overwrite } = *self;
-        let rotate_after = rotate_every.map(Duration::from_secs_f64);
-        LiveOptions { rotate_bytes: rotate_size, rotate_after, overwrite, ..LiveOptions::default() }
+        LiveOptions { rotate_bytes: rotate_size, rotate_after: rotate_every, overwrite, ..LiveOptions::default() }
     }
 }
 

@@ -268,7 +268,7 @@ fn another_hand_or_a_model_unlike_its_neighbours_is_refused() {
         assert_refused(&graph, &[node, "--set", &model], &[&format!("'{node}' is made for the "), "--allow-mismatch"]);
     }
     let in_shadow = ["encoder", "classifier", "--shadow", "0.5", "--set", &model];
-    assert_refused(&graph, &in_shadow, &["In the shadow it reads the running nodes", "view --shadow MODEL"]);
+    assert_refused(&graph, &in_shadow, &["without --shadow", "view --shadow MODEL"]);
     graph.stop().assert_undisturbed("refused mismatches");
 }
 

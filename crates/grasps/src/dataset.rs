@@ -82,13 +82,18 @@ pub fn hand_of(recording: &Path, hand: Option<&Path>) -> Result<Hand, DatasetErr
 
 /// The hand whose files are attached to a recording, if its layout is not that of the built-in hand.
 fn attached_hand(recording: &Path, built_in: &Hand) -> Option<Hand> {
-    let files = attachments(recording).ok()?;
-    let text = |name: &str| {
-        let file = files.iter().find(|file| file.name == name)?;
-        String::from_utf8(file.data.to_vec()).ok()
-    };
-    let layout = text(ShownHand::LAYOUT_NAME).filter(|layout| *layout != built_in.files()[0])?;
-    let urdf = text(ShownHand::URDF_NAME)?;
+    let (mut layout, mut urdf) = (None, None);
+    for file in attachments(recording).ok()? {
+        match file.name.as_str() {
+            ShownHand::LAYOUT_NAME => layout = String::from_utf8(file.data.into_owned()).ok(),
+            ShownHand::URDF_NAME => urdf = String::from_utf8(file.data.into_owned()).ok(),
+            _ => {}
+        }
+    }
+    let (layout, urdf) = (layout?, urdf?);
+    if layout == built_in.files()[0] {
+        return None;
+    }
     Hand::parse(recording, &layout, |_| Ok(urdf)).ok()
 }
 

@@ -112,22 +112,22 @@ pub(super) struct Placed<'a> {
 
 impl<'a> Placed<'a> {
     pub(super) fn new(hand: &'a Hand, grasp: &'a RecordedGrasp) -> Result<Self, PictureError> {
-        let unfit = |why: String| PictureError::Grasp { grasp_id: grasp.grasp_id, why };
+        let grasp_id = grasp.grasp_id;
         for (idx, frame) in grasp.frames.iter().enumerate() {
             let (found, expected) = (frame.message.cells_newtons.len(), hand.n_cells());
             if found != expected {
-                return Err(unfit(format!(", frame {idx}: {found} cells, the hand has {expected}")));
+                return Err(unfit(grasp_id, format!(", frame {idx}: {found} cells, the hand has {expected}")));
             }
             // Every frame is shown in the end: all of them must fit.
-            hand.palm_from_links(&frame.message.joints).map_err(|error| unfit(format!(": {error}")))?;
+            hand.palm_from_links(&frame.message.joints).map_err(|error| unfit(grasp_id, format!(": {error}")))?;
         }
         let settled = grasp.frames.iter().rev().find(|frame| frame.message.phase == Phase::Settled);
         let frame = if grasp.is_hand_alone { grasp.frames.first() } else { settled.or(grasp.frames.last()) }
             .map(|frame| &frame.message)
-            .ok_or_else(|| unfit(" has no frames: expected at least one".into()))?;
+            .ok_or(unfit(grasp_id, " has no frames: expected at least one".into()))?;
         // The scene's joints are what the contacts belong to; the frame's are rounded by the encoders.
         let joints = grasp.scene.as_ref().map_or(&frame.joints, |scene| &scene.joints);
-        hand.palm_from_links(joints).map_err(|error| unfit(format!(": {error}")))?;
+        hand.palm_from_links(joints).map_err(|error| unfit(grasp_id, format!(": {error}")))?;
         let (mut notes, mut contacts, mut object_in_palm) = (Vec::new(), Vec::new(), None);
         match (&grasp.scene, &grasp.object) {
             (None, _) if grasp.is_hand_alone => {}
@@ -150,15 +150,17 @@ impl<'a> Placed<'a> {
     }
 }
 
+fn unfit(grasp_id: u64, why: String) -> PictureError {
+    PictureError::Grasp { grasp_id, why }
+}
+
 fn contact_marks(hand: &Hand, scene: &GraspScene) -> Result<Vec<ContactMark>, PictureError> {
     // A contact is felt if it can bring the hand's finest cell above its noise.
     let threshold_newtons = hand.cells().map(|(_, cell)| cell.noise_threshold_newtons).fold(f64::INFINITY, f64::min);
-    let link_name = |idx: i64| {
-        let link = usize::try_from(idx).ok().and_then(|idx| hand.links.get(idx));
-        link.map(|link| link.name.clone()).ok_or_else(|| {
-            let why = format!(": a contact of link {idx}, the hand has the links 0 to {}", hand.links.len() - 1);
-            PictureError::Grasp { grasp_id: scene.grasp_id, why }
-        })
+    let last = hand.links.len() - 1;
+    let link_name = |idx: i64| match usize::try_from(idx).ok().and_then(|idx| hand.links.get(idx)) {
+        Some(link) => Ok(link.name.clone()),
+        None => Err(unfit(scene.grasp_id, format!(": a contact of link {idx}, the hand has the links 0 to {last}"))),
     };
     scene
         .contacts

@@ -136,8 +136,6 @@ pub enum InvalidModel {
         MAX_BYTES >> 20
     )]
     TooLarge,
-    #[error("not a model (not UTF-8): expected JSON made by blindgrasp train")]
-    NotUtf8,
     /// It is a file of another kind, which the text describes.
     #[error("not a model: expected JSON made by blindgrasp train, found {0}")]
     OtherKind(&'static str),
@@ -181,7 +179,7 @@ impl Model {
         if let Some(kind) = FileKind::of(&bytes).filter(|kind| !matches!(kind, FileKind::Model | FileKind::Json)) {
             return Err(invalid(InvalidModel::OtherKind(kind.description())));
         }
-        let text = String::from_utf8(bytes).map_err(|_| invalid(InvalidModel::NotUtf8))?;
+        let text = String::from_utf8(bytes).map_err(|_| invalid(InvalidModel::NotAModel("not UTF-8".into())))?;
         Model::parse(&text).map_err(invalid)
     }
 

@@ -89,7 +89,7 @@ pub(super) struct Arguments {
     /// many attempts.
     #[arg(long, value_name = "ATTEMPTS", conflicts_with_all = ["split", "json"], value_parser = |text: &str| number_in(text, 0.0..=1e6))]
     drop_costs: Option<f64>,
-    /// Pad layout of the hand; default: the built-in hand that the first recording names.
+    /// Pad layout of the hand; default: that of the first recording, if its name is a built-in one.
     #[arg(long, add = completions::hands())]
     hand: Option<PathBuf>,
     /// Print JSON, with every number of the report.

@@ -59,7 +59,7 @@ struct AdaptArguments {
     /// labelled grasps of one day or more, some stable and some not.
     #[arg(required = true)]
     recordings: Vec<PathBuf>,
-    /// Pad layout of the hand; default: the built-in hand that the first recording names.
+    /// Pad layout of the hand; default: that of the first recording, if its name is a built-in one.
     #[arg(long, add = completions::hands())]
     hand: Option<PathBuf>,
     /// Where to write the model.

@@ -37,7 +37,7 @@ struct LearnArguments {
     /// Recordings (MCAP) with all frames of 200 or more grasps; some thousand are good.
     #[arg(required = true)]
     recordings: Vec<PathBuf>,
-    /// Pad layout of the hand; default: the built-in hand that the first recording names.
+    /// Pad layout of the hand; default: that of the first recording, if its name is a built-in one.
     #[arg(long, add = completions::hands())]
     hand: Option<PathBuf>,
     /// Seed of the faults that are put in.
@@ -60,7 +60,7 @@ struct CheckArguments {
     /// Recordings (MCAP), in the order in which they were made.
     #[arg(required = true)]
     recordings: Vec<PathBuf>,
-    /// Pad layout of the hand; default: the built-in hand that the first recording names.
+    /// Pad layout of the hand; default: that of the first recording, if its name is a built-in one.
     #[arg(long, add = completions::hands())]
     hand: Option<PathBuf>,
     /// Print JSON.

@@ -33,7 +33,7 @@ pub(super) struct Arguments {
     /// Replace files of these names
     #[arg(long)]
     overwrite: bool,
-    /// Pad layout of the hand; default: the built-in hand that the first recording names.
+    /// Pad layout of the hand; default: that of the first recording, if its name is a built-in one.
     #[arg(long, add = completions::hands())]
     hand: Option<PathBuf>,
     /// The features and the learner: boosted (the histogram, pads and joints, boosted trees), wrist (the same with gravity

@@ -35,13 +35,11 @@ pub fn warnings(status: &GraphStatus) -> Vec<String> {
         warnings.push(format!("grasps are not decided without {which}: swap it (blindgrasp swap) or stop the graph"));
     }
     for EdgeStatus { policy, dropped, from, to, capacity, .. } in &status.edges {
-        let has_failed = to.split_once('/').is_some_and(|(node, _)| failed.contains(&node));
-        if *policy == EdgePolicy::Lossless && *dropped > 0 {
-            warnings.push(if has_failed {
-                format!("{dropped} samples of {from} have not reached {to}, of which a swap takes the last {capacity}")
-            } else {
-                format!("{dropped} samples were lost between {from} and {to}, whose edge is lossless")
-            });
+        // The last samples wait for the swap of a reader that has failed.
+        let has_failed = failed.iter().any(|node| to.split('/').next() == Some(node));
+        let n_lost = dropped.saturating_sub(if has_failed { *capacity as u64 } else { 0 });
+        if *policy == EdgePolicy::Lossless && n_lost > 0 {
+            warnings.push(format!("{n_lost} samples were lost between {from} and {to}, whose edge is lossless"));
         }
     }
     warnings.extend(status.link.iter().flat_map(|link| &link.peers).filter_map(trouble));

@@ -366,15 +366,10 @@ impl<S: Surroundings> Lifecycle<S> {
                     {
                         let whose =
                             if is_itself { "the running one".into() } else { format!("node '{}'", member.node.id) };
-                        let advice = if is_replaced {
-                            "In the shadow it reads the running nodes: compare models by `blindgrasp view --shadow MODEL`, and \
-                             swap without --shadow"
-                        } else {
-                            "Swap the nodes together (blindgrasp swap A B --set …)"
-                        };
                         return Some(format!(
                             "the replacement of '{}' is made for the {key} {value}, {whose} for {theirs}: the arbiter would \
-                             hold every grasp. {advice}, or say --allow-mismatch",
+                             hold every grasp. Swap the nodes together (blindgrasp swap A B --set …), without --shadow, in which a \
+                             replacement reads the running nodes (view --shadow MODEL compares models), or say --allow-mismatch",
                             target.node.id
                         ));
                     }

@@ -1,6 +1,6 @@
 //! Pairs decisions with truths and outcomes while a graph runs, and keeps the figures that the summary needs.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use hdrhistogram::Histogram;
@@ -40,7 +40,7 @@ pub(super) struct RunLog<S> {
     /// Truths whose decision has not come.
     truths: BTreeMap<u64, GraspTruth>,
     /// The latest decisions, each with its truth if that has come.
-    decisions: BTreeMap<u64, (LiftDecision, Option<GraspTruth>)>,
+    decisions: VecDeque<(LiftDecision, Option<GraspTruth>)>,
     /// Outcomes of grasps whose decision has not been read.
     outcomes: BTreeMap<u64, LiftOutcome>,
     /// The grasp that was decided last.
@@ -71,7 +71,7 @@ impl<S: RunSink> RunLog<S> {
             n_decisions: 0,
             n_undecided: 0,
             truths: BTreeMap::new(),
-            decisions: BTreeMap::new(),
+            decisions: VecDeque::new(),
             outcomes: BTreeMap::new(),
             last_decided: None,
             // Three digits take some tens of kilobytes, however long the run is.
@@ -97,25 +97,27 @@ impl<S: RunSink> RunLog<S> {
         }
     }
 
-    /// Adds a truth that came after its decision, or after the truth `before`, to the graph's status. Returns whether it has the
-    /// decision with that truth.
-    fn show_truth(&self, truth: &GraspTruth, before: Option<bool>) -> bool {
+    /// Adds a truth that came after its decision, or after the truth `before`, to the graph's status.
+    fn show_truth(&self, truth: &GraspTruth, before: Option<bool>) {
         let mut status = self.status.lock().unwrap_or_else(PoisonError::into_inner);
         let decided = status.latest.iter_mut().rfind(|it| it.grasp_id == truth.grasp_id && it.truth == before);
-        let Some(decided) = decided else { return false };
+        let Some(decided) = decided else { return };
         decided.truth = Some(truth.stable);
         let is_false_positive = decided.is_false_positive();
         status.n_false_positives += u64::from(is_false_positive);
-        true
     }
 
     fn on_truth(&mut self, truth: GraspTruth) {
-        let before = self.decisions.get(&truth.grasp_id).map(|(_, known)| known.as_ref().map(|known| known.stable));
-        // An object that was kept may be dropped after that.
-        let is_news = before == Some(None) || before == Some(Some(true)) && !truth.stable;
-        let is_shown = before.is_some_and(|before| is_news && self.show_truth(&truth, before));
-        match self.decisions.get_mut(&truth.grasp_id) {
-            Some((_, known)) if is_shown || known.is_none() => *known = Some(truth),
+        match self.decisions.iter_mut().rfind(|(decision, _)| decision.grasp_id == truth.grasp_id) {
+            Some((_, known @ None)) => {
+                *known = Some(truth.clone());
+                self.show_truth(&truth, None);
+            }
+            // An object that was kept may be dropped after that.
+            Some((_, Some(known))) if known.stable && !truth.stable => {
+                *known = truth.clone();
+                self.show_truth(&truth, Some(true));
+            }
             _ => drop(self.truths.insert(truth.grasp_id, truth)),
         }
         // A decision comes soon after its truth: the oldest truths will have none.
@@ -163,12 +165,10 @@ impl<S: RunSink> RunLog<S> {
         }
         self.n_decisions += 1;
         self.n_lift += usize::from(message.action == Action::Lift);
-        if let Some((decision, truth)) = self.decisions.insert(message.grasp_id, (message.clone(), truth)) {
-            self.evaluation.add(&decision, truth.as_ref());
-        }
+        self.decisions.push_back((message.clone(), truth));
         // A truth comes before its decision or right after it: the oldest decisions will have none.
         while self.decisions.len() > MAX_AWAITING_TRUTH
-            && let Some((_, (decision, truth))) = self.decisions.pop_first()
+            && let Some((decision, truth)) = self.decisions.pop_front()
         {
             self.evaluation.add(&decision, truth.as_ref());
         }
@@ -181,7 +181,7 @@ impl<S: RunSink> RunLog<S> {
         ran: &Ran<'_>,
         observed: &BTreeMap<String, InputCounts>,
     ) -> anyhow::Result<(RunSummary, S)> {
-        for (decision, truth) in self.decisions.values() {
+        for (decision, truth) in &self.decisions {
             self.evaluation.add(decision, truth.as_ref());
         }
         for outcome in self.outcomes.values() {

@@ -25,9 +25,6 @@ const MAX_ASIDES: usize = 10_000;
 /// The longest text of a log line or a failure: the launcher reads lines of up to 64 KiB.
 const MAX_TEXT_BYTES: usize = 4096;
 
-/// What a pipe's error is about.
-const NO_PIPE: &str = "the pipe to its program does not work";
-
 /// A program that works for this process.
 pub(super) struct Program {
     process: Child,
@@ -134,9 +131,7 @@ impl Program {
     /// Its answer to [`Ask::Start`].
     pub(super) fn ready<T: serde::de::DeserializeOwned>(&mut self) -> anyhow::Result<T> {
         match self.next()? {
-            Some((Say::Ready, body)) => {
-                serde_json::from_slice(&body).context("its program's answer to Start cannot be read")
-            }
+            Some((Say::Ready, body)) => parsed(&body, "answer to Start"),
             Some((found, _)) => Err(unexpected(found, "that it is ready")),
             None => Err(ended(&self.end(), Ask::Start)),
         }
@@ -184,7 +179,7 @@ impl Program {
         let Some(to) = &mut self.to else { return Err(ended("", ask)) };
         match to.write_all(&self.out) {
             Err(error) if error.kind() == std::io::ErrorKind::BrokenPipe => Err(self.reason_of_end(ask)),
-            outcome => outcome.context(NO_PIPE),
+            outcome => outcome.context("the pipe to its program does not work"),
         }
     }
 
@@ -210,8 +205,7 @@ impl Program {
     fn take_in(&mut self, kind: Say, body: &[u8]) -> anyhow::Result<()> {
         match kind {
             Say::Log => {
-                let mut line: LogEntry =
-                    serde_json::from_slice(body).context("its program's log line cannot be read")?;
+                let mut line: LogEntry = parsed(body, "log line")?;
                 line.text = shortened(&line.text);
                 if serde_json::to_string(&line.fields).is_ok_and(|fields| fields.len() > MAX_TEXT_BYTES) {
                     line.fields = LogEntry::plain("").fields;
@@ -220,9 +214,7 @@ impl Program {
                 self.asides.lines.push(line);
             }
             Say::Counts => {
-                let counts: std::collections::BTreeMap<String, u64> =
-                    serde_json::from_slice(body).context("its program's counts cannot be read")?;
-                self.asides.counts.extend(counts);
+                self.asides.counts.extend(parsed::<std::collections::BTreeMap<String, u64>>(body, "counts")?);
             }
             _ => bail!(shortened(&String::from_utf8_lossy(body))),
         }
@@ -246,7 +238,7 @@ impl Program {
                     return Ok(Some((say, body)));
                 }
             }
-            if !self.read_more().context(NO_PIPE)? {
+            if !self.read_more().context("the pipe to its program does not work")? {
                 if self.used < self.read.len() {
                     bail!("its program said a part of a message, and ended{}, expected a whole message", self.end());
                 }
@@ -313,6 +305,10 @@ fn shortened(text: &str) -> String {
 
 fn unexpected(found: Say, expected: &'static str) -> anyhow::Error {
     anyhow!("its program said {found:?}, expected {expected}")
+}
+
+fn parsed<T: serde::de::DeserializeOwned>(body: &[u8], what: &str) -> anyhow::Result<T> {
+    serde_json::from_slice(body).with_context(|| format!("its program's {what} cannot be read"))
 }
 
 fn ended(how: &str, to: Ask) -> anyhow::Error {

@@ -280,8 +280,8 @@ impl UntypedSubscriber {
             return Ok(Some(self.delivered(sample)));
         }
         loop {
-            let failed = |source| PortError::new(&self.service, "cannot receive", Some(source));
-            let sample = self.subscriber.receive().map_err(|error| failed(error.into()))?;
+            let sample = self.subscriber.receive();
+            let sample = sample.map_err(|error| PortError::new(&self.service, "cannot receive", Some(error.into())))?;
             let Some(sample) = sample else {
                 // Only now, because the samples that a held one waits for may have been in the queue.
                 let overdue =
