@@ -134,8 +134,9 @@ impl ParamKind {
         let text = match (self, text) {
             // Programs that read YAML 1.1 write the words on and off as true and false.
             (Self::Choice { values: words } | Self::Number { words, .. }, "true" | "false") if plain => {
-                let word = if text == "true" { "on" } else { "off" };
-                if words.iter().any(|known| known == word) { word } else { text }
+                let (word, other) = if text == "true" { ("on", "yes") } else { ("off", "no") };
+                let is_it = words.iter().any(|known| known == word) && words.iter().all(|known| known != other);
+                if is_it { word } else { text }
             }
             _ => text,
         };
