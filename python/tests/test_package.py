@@ -825,7 +825,10 @@ class Mjcf(Folder):
                     link = shapes[model.body(model.geom_bodyid[geom]).name]
                     np.testing.assert_allclose(link[0][:3, 3], data.geom_xpos[geom], atol=1e-7)
                     np.testing.assert_allclose(link[0][:3, :3], data.geom_xmat[geom].reshape(3, 3), atol=1e-7)
-        # The capsule is a cylinder and two balls.
+        # The capsule is a cylinder and two balls at its ends.
+        ends = [pose[:3, 3] for pose in shapes["f1"][1:3]]
+        np.testing.assert_allclose(np.mean(ends, axis=0), shapes["f1"][0][:3, 3], atol=1e-7)
+        np.testing.assert_allclose(ends[0] - ends[1], 0.06 * shapes["f1"][0][:3, 2], atol=1e-7)
         self.assertEqual(sum(map(len, shapes.values())), 6)
         self.assert_ros_reads(root)
         listed = subprocess.run(

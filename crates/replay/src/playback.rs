@@ -15,6 +15,7 @@ const LATE_NANOS: u64 = 60_000_000_000;
 pub enum PlaybackError {
     #[error(transparent)]
     Recording(#[from] RecordingError),
+    /// The recording does not fit its metadata, or the caller's selection.
     #[error("recording {}: {message}", path.display())]
     Unfit { path: PathBuf, message: String },
 }

@@ -31,6 +31,7 @@ pub struct GraspIds(Vec<(u64, u64)>);
 
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum SelectionError {
+    /// Two recordings were mixed into one.
     #[error(
         "sample {seq} is of the source's epoch {epoch:016x}, after samples of a later epoch: two recordings were mixed into one, \
          and the order of their samples is unknown; record them apart"

@@ -141,8 +141,10 @@ pub enum InvalidModel {
     OtherKind(&'static str),
     #[error("not a model, or cut off: expected JSON made by blindgrasp train ({0})")]
     NotAModel(String),
+    /// It has the format, but not what belongs to it.
     #[error("not a valid model: {0}")]
     Malformed(String),
+    /// The file is whole, and another program with the same format wrote it.
     #[error(
         "another build of blindgrasp, version {version}, wrote it, and this one, version {}, does not know its fields \
          ({reason}): train it again with this one (blindgrasp train)",

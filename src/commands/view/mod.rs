@@ -110,7 +110,7 @@ struct GraspArguments {
     /// Number of the grasp [default: the recording's first]
     #[arg(long)]
     grasp: Option<u64>,
-    /// Pad layout of the hand [default: the built-in hand that the recording names]
+    /// Pad layout of the hand [default: that of the recording, if its name is a built-in one]
     #[arg(long, add = completions::hands())]
     hand: Option<PathBuf>,
     /// Folder of the objects' meshes [default: the built-in objects]
