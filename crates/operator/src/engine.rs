@@ -124,7 +124,8 @@ pub(crate) trait Site {
     /// Drops the saved state, because the active instance saves none.
     fn forget_state(&mut self);
 
-    /// Whether the launcher has a command, or asks for the end.
+    /// Whether the launcher has a command or asks for the end, or ports and worker are to be looked at, also of a stage that is
+    /// always behind.
     fn is_interrupted(&self) -> bool;
     fn should_stop(&self) -> bool;
     fn beat(&self);

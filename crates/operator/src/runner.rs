@@ -36,6 +36,8 @@ pub(crate) struct Ports {
     pub(crate) inputs: Vec<InputPort>,
     pub(crate) outputs: Vec<OutputPort>,
     partners: Partners,
+    /// When writers, readers and the worker were looked at.
+    last_look: Instant,
 }
 
 pub(crate) struct InputPort {
@@ -87,7 +89,13 @@ impl OutputPort {
 impl Ports {
     /// The ports of an operator, and the partner inputs that it has opened.
     pub(crate) fn new(operator: &Operator, inputs: Vec<InputPort>, outputs: Vec<OutputPort>) -> Ports {
-        Ports { operator: operator.clone(), inputs, outputs, partners: Partners::of(operator) }
+        Ports {
+            operator: operator.clone(),
+            inputs,
+            outputs,
+            partners: Partners::of(operator),
+            last_look: Instant::now(),
+        }
     }
 
     /// Looks for writers that have come.
@@ -245,7 +253,7 @@ impl Site for Ports {
     }
 
     fn is_interrupted(&self) -> bool {
-        self.operator.has_command() || self.operator.should_quit()
+        self.operator.has_command() || self.operator.should_quit() || self.last_look.elapsed() >= TICK
     }
 
     fn should_stop(&self) -> bool {
@@ -299,7 +307,6 @@ struct Runner<W> {
     site: Ports,
     engine: Engine<UntypedSample, W>,
     identity: BTreeMap<String, String>,
-    last_look: Instant,
     is_drained: bool,
 }
 
@@ -321,7 +328,7 @@ pub(crate) fn run<W: Worker<UntypedSample> + 'static>(
     }
     let engine = Engine::begin(&mut site, worker, book, manner, operator.begins_as_standby())?;
     site.connect()?;
-    let runner = Runner { site, engine, identity, last_look: Instant::now(), is_drained: false };
+    let runner = Runner { site, engine, identity, is_drained: false };
     match operator.group() {
         Some(group) => group.tasks.borrow_mut().push(Box::new(runner)),
         None => run_in_turn(vec![Box::new(runner)])?,
@@ -374,8 +381,9 @@ impl<W: Worker<UntypedSample>> Runner<W> {
         }
         // Sending and receiving look as well; between samples there is no hurry, and a reader that was woken may need the
         // core.
-        if self.last_look.elapsed() >= TICK {
-            self.last_look = Instant::now();
+        let is_interrupted = self.site.is_interrupted();
+        if self.site.last_look.elapsed() >= TICK {
+            self.site.last_look = Instant::now();
             self.site.operator.look_at_descriptors()?;
             self.site.look_for_readers()?;
             self.site.connect()?;
@@ -383,7 +391,7 @@ impl<W: Worker<UntypedSample>> Runner<W> {
             self.site.partners.report(&self.site.operator);
         }
         Ok(match sent {
-            _ if self.site.is_interrupted() => Turn::Interrupted,
+            _ if is_interrupted || self.site.is_interrupted() => Turn::Interrupted,
             // For the sake of another operator of its group. Nobody says when its reader has room.
             Sent::GaveWay => Turn::Idle(Some(Instant::now() + ROOM_PAUSE)),
             Sent::Yes => Turn::Idle(self.deadline()),
