@@ -4,6 +4,5 @@ mod commands;
 
 fn main() -> std::process::ExitCode {
     commands::hand_over();
-    commands::answer_caller();
     commands::main()
 }

@@ -111,9 +111,9 @@ fn print_graph(graph: &Graph) -> std::io::Result<()> {
 fn print_machines(machines: &Machines) -> std::io::Result<()> {
     let rows = machines.machines.iter().map(|machine| {
         let listen = if machine.listen.is_empty() { "-".into() } else { machine.listen.join(", ") };
-        vec![machine.name.clone(), listen, machine.ssh.clone().unwrap_or_else(|| machine.name.clone())]
+        vec![machine.name.clone(), listen]
     });
-    print_table(["machine", "listens at", "for ssh"].map(String::from).to_vec(), rows)?;
+    print_table(["machine", "listens at"].map(String::from).to_vec(), rows)?;
     let link = &machines.link;
     let mut said =
         vec![format!("cut off after {} ms", link.deadline_millis), format!("buffer {} samples", link.buffer)];

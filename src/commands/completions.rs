@@ -7,7 +7,7 @@ use clap_complete::env::Shells;
 
 use super::Outcome;
 use blindgrasp_cli::completions::VARIABLE;
-pub(super) use blindgrasp_cli::completions::{assignments, graphs, hands, machines, nodes, outputs};
+pub(super) use blindgrasp_cli::completions::{assignments, graphs, hands, nodes, outputs};
 
 /// Print a script that completes commands in a shell
 ///

@@ -9,7 +9,6 @@ use std::time::{Duration, Instant};
 use anyhow::Context;
 use clap::Args;
 
-use super::elsewhere::MachineArgument;
 use super::export::json_of;
 use super::ros_messages::RosMessages;
 use super::view::live::hand_of;
@@ -51,8 +50,6 @@ pub(super) struct Arguments {
     /// may act upon it later (CLOCK_BOOTTIME).
     #[arg(long)]
     cdr: bool,
-    #[command(flatten)]
-    machine: MachineArgument,
 }
 
 /// Prints samples until there are enough.
@@ -105,9 +102,6 @@ impl Echo {
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
-    if let Some(destination) = arguments.machine.destination()? {
-        return destination.run();
-    }
     let stop: Arc<AtomicBool> = stop_signal()?;
     let graph = pick_graph(arguments.graph.as_deref())?;
     let mut connection = Connection::open(&graph)?;

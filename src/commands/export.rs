@@ -2,21 +2,26 @@
 
 use std::collections::BTreeSet;
 use std::fs::File;
-use std::io::{BufWriter, Write};
+use std::io::{BufRead, BufReader, BufWriter, Write};
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use clap::Args;
+use csv::StringRecord;
+use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use super::{Outcome, check_new, completions, data_on_stdout, print_line};
-use blindgrasp_cli::shard::Shard;
-use blindgrasp_grasps::dataset::{hand_of, label_of};
-use blindgrasp_grasps::feature_table::{FeatureTableError, write_feature_table};
-use blindgrasp_messages::files::{keep_mode, partial_path, private_file};
+use blindgrasp_cli::shard::{Place, Shard, merge_files};
+use blindgrasp_grasps::dataset::{hand_of_all, label_of};
+use blindgrasp_grasps::feature_table::{
+    COLUMNS, FeatureTable, FeatureTableError, merge_feature_rows, write_feature_table,
+};
+use blindgrasp_messages::files::{keep_mode, open_regular, partial_path, private_file};
 use blindgrasp_operator::text::counted;
 use blindgrasp_recording::{Record, RecordingReader, recordings_in};
 use blindgrasp_stages::model::Model;
+use blindgrasp_stages::training_summary::ReadingId;
 
 /// Write a recording as JSON lines, or a table of features
 ///
@@ -31,7 +36,7 @@ use blindgrasp_stages::model::Model;
                         sends them, each under its name: hist_3, finger_1.load, spread.position …")]
 pub(super) struct Arguments {
     /// The recording (MCAP); with --features, recordings or folders of them.
-    #[arg(required = true, value_name = "RECORDING")]
+    #[arg(required_unless_present = "merge", value_name = "RECORDING")]
     recordings: Vec<PathBuf>,
     /// Only this topic; may be given more than once.
     #[arg(long)]
@@ -45,17 +50,23 @@ pub(super) struct Arguments {
     /// Write the table of features (CSV) that this model sees of recorded grasps, for other tools to learn from.
     #[arg(long, value_name = "MODEL", requires = "out", conflicts_with = "topic")]
     features: Option<PathBuf>,
-    /// With --features, take only every N-th recording, from the I-th on (0/N to N-1/N).
+    /// With --features, take only every N-th recording, from the I-th on (0/N to N-1/N). The table's first line has the shard's
+    /// place in the whole (JSON), and the header follows.
     #[arg(long, value_name = "I/N", requires = "features")]
     shard: Option<Shard>,
+    /// Make the table of the whole from those of all shards.
+    #[arg(long, value_name = "FILE", num_args = 1.., requires = "out", conflicts_with_all = ["recordings", "topic", "features"])]
+    merge: Vec<PathBuf>,
     /// Pad layout of the hand, for --features; default: that of the first recording, if its name is a built-in one.
     #[arg(long, requires = "features", add = completions::hands())]
     hand: Option<PathBuf>,
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
-    if let (Some(model), Some(out)) = (&arguments.features, &arguments.out) {
-        return export_features(arguments, model, out);
+    match (&arguments.features, &arguments.out) {
+        (Some(model), Some(out)) => return export_features(arguments, model, out),
+        (None, Some(out)) if !arguments.merge.is_empty() => return merge_features(arguments, out),
+        _ => {}
     }
     let [recording] = arguments.recordings.as_slice() else {
         anyhow::bail!("{} recordings: expected one; only --features takes several", arguments.recordings.len());
@@ -72,34 +83,79 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
 }
 
 fn export_features(arguments: &Arguments, model: &Path, out: &Path) -> anyhow::Result<Outcome> {
-    let recordings = arguments.shard.unwrap_or_default().of(recordings_in(&arguments.recordings)?);
-    let Some(first) = recordings.first() else {
-        print_line("this shard has no recordings")?;
-        return Ok(Outcome::Done);
-    };
+    let recordings = recordings_in(&arguments.recordings)?;
     let file = NewFile::create(out, &[&recordings[..], &[model.to_path_buf()]].concat(), arguments.overwrite)?;
     let (path, model) = (model, Model::load(model)?);
-    let hand = hand_of(first, arguments.hand.as_deref())?;
+    let hand = hand_of_all(&recordings, arguments.hand.as_deref())?;
     if hand.id() != model.hand.id {
         anyhow::bail!(
             "{} is of the hand '{}' ({:016x}), {} of '{}' ({:016x}): expected the same",
             path.display(),
             model.hand.name,
             model.hand.id,
-            first.display(),
+            recordings[0].display(),
             hand.name,
             hand.id()
         );
     }
-    let written = write_feature_table(&hand, &model, &recordings, BufWriter::new(&file.file));
-    let written = written.map_err(|error| match error {
-        FeatureTableError::Dataset(of_recordings) => anyhow::Error::from(of_recordings),
-        error => anyhow::Error::from(error).context(format!("cannot write {}", out.display())),
-    })?;
+    let shard = arguments.shard.unwrap_or_default();
+    // The rows of a shard wait for the line before them, which counts them.
+    let (mut rows, mut to_file) = (Vec::new(), BufWriter::new(&file.file));
+    let to: &mut dyn Write = if arguments.shard.is_some() { &mut rows } else { &mut to_file };
+    let written = write_feature_table(&hand, &model, &recordings, |idx| shard.has(idx), to);
+    let table = written.map_err(|error| of_table(error, out))?;
+    if arguments.shard.is_some() {
+        let mut place = Place::new(shard, (model.hand.id, model.dictionary_id(), hand.description_id()), &recordings);
+        place.n_lines = table.readings.iter().map(Vec::len).collect();
+        writeln!(to_file, "{}", serde_json::to_string(&PlacedTable { place, readings: table.readings.concat() })?)?;
+        to_file.write_all(&rows)?;
+    }
+    to_file.flush().with_context(|| out.display().to_string())?;
+    drop(to_file);
     file.finish()?;
-    let grasps = counted(written.n_rows, "grasp");
-    print_line(&format!("{}: {grasps}, {} values each", out.display(), model.features.len()))?;
-    for (reason, n) in &written.n_excluded {
+    print_table(out, &table, model.features.len())
+}
+
+/// The first line of a shard's table.
+#[derive(Serialize, Deserialize)]
+struct PlacedTable {
+    #[serde(flatten)]
+    place: Place,
+    /// The reading of each row: the whole leaves out those that an earlier grasp has.
+    readings: Vec<ReadingId>,
+}
+
+fn merge_features(arguments: &Arguments, out: &Path) -> anyhow::Result<Outcome> {
+    let file = NewFile::create(out, &arguments.merge, arguments.overwrite)?;
+    const EXPECTED: &str = "expected a whole table of export --features --shard I/N";
+    let mut header = StringRecord::new();
+    let rows = merge_files(&arguments.merge, |path| {
+        let mut text = BufReader::new(open_regular(path)?);
+        let mut line = String::new();
+        text.read_line(&mut line).context(EXPECTED)?;
+        let PlacedTable { place, readings } = serde_json::from_str(&line).context(EXPECTED)?;
+        let mut table = csv::Reader::from_reader(text);
+        header.clone_from(table.headers().context(EXPECTED)?);
+        let rows = table.records().collect::<Result<Vec<_>, _>>().context(EXPECTED)?;
+        anyhow::ensure!(header.iter().take(COLUMNS.len()).eq(COLUMNS) && rows.len() == readings.len(), EXPECTED);
+        Ok((place, readings.into_iter().zip(rows).collect()))
+    })?;
+    let table = merge_feature_rows(&header, rows, BufWriter::new(&file.file)).map_err(|error| of_table(error, out))?;
+    file.finish()?;
+    print_table(out, &table, header.len() - COLUMNS.len())
+}
+
+fn of_table(error: FeatureTableError, out: &Path) -> anyhow::Error {
+    match error {
+        FeatureTableError::Dataset(of_recordings) => of_recordings.into(),
+        error => anyhow::Error::from(error).context(format!("cannot write {}", out.display())),
+    }
+}
+
+fn print_table(out: &Path, table: &FeatureTable, n_values: usize) -> anyhow::Result<Outcome> {
+    let grasps = counted(table.readings.concat().len(), "grasp");
+    print_line(&format!("{}: {grasps}, {n_values} values each", out.display()))?;
+    for (reason, n) in &table.n_excluded {
         print_line(&format!("left out: {n} with {reason}"))?;
     }
     Ok(Outcome::Done)

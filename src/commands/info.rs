@@ -3,13 +3,13 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
-use anyhow::{Context, bail};
+use anyhow::bail;
 use clap::Args;
 
 use super::{Outcome, completions, hand_cells, percent, print_line, print_text};
 use blindgrasp_cli::joint;
 use blindgrasp_graph::client::{is_graph_name, running_graphs};
-use blindgrasp_grasps::dataset::{REPORT_METADATA, hand_of};
+use blindgrasp_grasps::dataset::{REPORT_METADATA, hand_of_all};
 use blindgrasp_grasps::summary::{Overview, RecordingsSummary};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::text::{counted, did_you_mean};
@@ -90,8 +90,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         print_diagnostic("these are the contents of the index; --full reads the recordings and sums up the grasps too");
         return Ok(Outcome::Done);
     }
-    let first = recordings.first().context("expected a recording")?;
-    let hand = hand_of(first, arguments.hand.as_deref())?;
+    let hand = hand_of_all(&recordings, arguments.hand.as_deref())?;
     hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
     let summary = RecordingsSummary::read(&hand, &recordings, overview)?;
     if arguments.json {

@@ -5,7 +5,6 @@ use std::time::Duration;
 use anyhow::{Context, bail};
 use clap::Args;
 
-use super::elsewhere::MachineArgument;
 use super::{Outcome, completions, print_line};
 use blindgrasp_graph::client::{ClientError, is_graph_name, pick_graph, running_graphs, status};
 use blindgrasp_graph::log::{LogFolder, LogLine, LogTail};
@@ -35,14 +34,9 @@ pub(super) struct Arguments {
     /// {"time", "operator", "level", "text", "fields"}
     #[arg(long)]
     json: bool,
-    #[command(flatten)]
-    machine: MachineArgument,
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
-    if let Some(destination) = arguments.machine.destination()? {
-        return destination.run();
-    }
     let folder = log_folder(arguments.graph.as_deref())?;
     let opened = LogTail::open(folder, arguments.operator.as_deref(), arguments.lines);
     if let (Err(_), Some(name)) = (&opened, &arguments.operator)

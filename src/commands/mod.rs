@@ -5,7 +5,6 @@ mod check;
 mod completions;
 mod doctor;
 mod echo;
-mod elsewhere;
 mod export;
 mod hand_cells;
 mod info;
@@ -27,8 +26,6 @@ mod swap;
 mod test;
 mod top;
 mod view;
-
-pub(crate) use elsewhere::answer_caller;
 
 use std::ffi::OsString;
 

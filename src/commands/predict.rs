@@ -8,9 +8,10 @@ use serde_json::json;
 
 use super::{Outcome, completions, print_line};
 use blindgrasp_cli::frame_lines::read_frames;
-use blindgrasp_cli::shard::Shard;
+use blindgrasp_cli::shard::{Place, Shard, merge_files};
 use blindgrasp_grasps::dataset::hand_of;
 use blindgrasp_grasps::decide::{Decided, decide, decide_frames, has_probability};
+use blindgrasp_messages::files::read_regular;
 use blindgrasp_messages::{GraspTruth, LiftDecision};
 use blindgrasp_recording::recordings_in;
 use blindgrasp_stages::{ArbiterOptions, Hand, Judge, Model, Probe};
@@ -27,9 +28,10 @@ use blindgrasp_stages::{ArbiterOptions, Hand, Judge, Model, Probe};
                         the hand_id is another.")]
 pub(super) struct Arguments {
     /// The model (JSON)
-    model: PathBuf,
+    #[arg(required_unless_present = "merge")]
+    model: Option<PathBuf>,
     /// Recordings (MCAP), folders of them, or frames as lines of JSON (- for stdin)
-    #[arg(required = true, value_name = "FILE")]
+    #[arg(required_unless_present = "merge", value_name = "FILE")]
     files: Vec<PathBuf>,
     /// Pad layout of the hand [default: the built-in hand of the model]
     #[arg(long, add = completions::hands())]
@@ -38,9 +40,12 @@ pub(super) struct Arguments {
     /// those after the test lift
     #[arg(long, default_value = "none")]
     probe: ProbeWord,
-    /// Take only every N-th file, from the I-th on (0/N to N-1/N); the lines of all shards are those of the whole
-    #[arg(long, value_name = "I/N", default_value = "0/1", hide_default_value = true)]
-    shard: Shard,
+    /// Take only every N-th file, from the I-th on (0/N to N-1/N). With --json, a last line has the shard's place in the whole
+    #[arg(long, value_name = "I/N")]
+    shard: Option<Shard>,
+    /// Decide nothing: print the JSON of the whole, from the files with that of each shard
+    #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with_all = ["model", "files", "hand", "probe", "shard"])]
+    merge: Vec<PathBuf>,
     /// Print JSON, one object a grasp
     #[arg(long)]
     json: bool,
@@ -66,7 +71,8 @@ impl From<ProbeWord> for Probe {
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
-    let model = Model::load(&arguments.model)?;
+    let Some(path) = &arguments.model else { return print_merged(&arguments.merge) };
+    let model = Model::load(path)?;
     let probe = Probe::from(arguments.probe);
     let can_judge = match probe {
         Probe::None => true,
@@ -76,29 +82,55 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     anyhow::ensure!(
         can_judge,
         "{} does not judge grasps after this probe: expected a model trained on lifts with its frames, or another --probe",
-        arguments.model.display()
+        path.display()
     );
     let options = ArbiterOptions { probe, ..ArbiterOptions::default() };
-    for file in &arguments.shard.of(recordings_in(&arguments.files)?) {
+    let (files, shard) = (recordings_in(&arguments.files)?, arguments.shard.unwrap_or_default());
+    let hand_file = match &arguments.hand {
+        Some(hand) => std::fs::read(hand).ok(),
+        None => None,
+    };
+    let settings = (std::fs::read(path)?, &arguments.hand, hand_file, arguments.probe as u8);
+    let mut place = Place::new(shard, settings, &files);
+    for file in &shard.of(files) {
         let is_recording = file.extension().is_some_and(|extension| extension == "mcap");
         if is_recording {
             let hand = hand_of(file, arguments.hand.as_deref())?;
             let judge = Judge::with_options(hand, model.clone(), options);
             let mut judge = judge.with_context(|| format!("recording {}", file.display()))?;
-            for decided in decide(&mut judge, file)? {
+            let all = decide(&mut judge, file)?;
+            place.n_lines.push(all.len());
+            for decided in all {
                 print(arguments.json, file, &decided, decided.truth.as_ref())?;
             }
         } else {
             let hand = hand_of_model(&model, arguments.hand.as_deref())?;
             let read = read_frames(file, &hand)?;
             let mut judge = Judge::with_options(hand, model.clone(), options)?;
-            for decided in decide_frames(&mut judge, &read.frames) {
+            let all = decide_frames(&mut judge, &read.frames);
+            place.n_lines.push(all.len());
+            for decided in all {
                 let grasp_id = decided.decision.grasp_id;
                 let known = read.truths.range((grasp_id, 0)..=(grasp_id, u64::MAX)).next();
                 print(arguments.json, file, &decided, known.map(|(_, (_, truth))| truth))?;
             }
         }
     }
+    if arguments.json && arguments.shard.is_some() {
+        print_line(&serde_json::to_string(&place)?)?;
+    }
+    Ok(Outcome::Done)
+}
+
+/// Prints the lines of the whole, from those of all shards.
+fn print_merged(paths: &[PathBuf]) -> anyhow::Result<Outcome> {
+    let lines = merge_files(paths, |path| {
+        let mut lines: Vec<String> = read_regular(path)?.lines().map(String::from).collect();
+        let place = serde_json::from_str(&lines.pop().unwrap_or_default())
+            .context("expected the whole JSON of predict --shard I/N --json: the last line has no place")?;
+        Ok((place, lines))
+    })?;
+    lines.iter().try_for_each(|line| print_line(line))?;
     Ok(Outcome::Done)
 }
 

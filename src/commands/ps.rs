@@ -6,7 +6,6 @@ use std::time::Duration;
 use clap::Args;
 use serde::Serialize;
 
-use super::elsewhere::MachineArgument;
 use super::promises::{RobotPromise, creep_in};
 use super::text_table::TextTable;
 use super::{Outcome, completions, print_line};
@@ -32,8 +31,6 @@ pub(super) struct Arguments {
     /// Print JSON
     #[arg(long)]
     json: bool,
-    #[command(flatten)]
-    machine: MachineArgument,
 }
 
 #[derive(Serialize)]
@@ -60,9 +57,6 @@ struct Silent {
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
-    if let Some(destination) = arguments.machine.destination()? {
-        return destination.run();
-    }
     let listing = match &arguments.graph {
         Some(graph) => {
             let status = status(&pick_graph(Some(graph))?)?;

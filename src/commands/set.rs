@@ -7,7 +7,6 @@ use anyhow::bail;
 use clap::Args;
 use serde_json::{Value, json};
 
-use super::elsewhere::MachineArgument;
 use super::text_table::TextTable;
 use super::{Outcome, completions, print_line, print_text};
 use blindgrasp_cli::graph_file::{describe, warn_of_misfit};
@@ -41,8 +40,6 @@ pub(super) struct Arguments {
     /// Print JSON: what was changed; the value; or one object a parameter, with node, param, value, live
     #[arg(long)]
     json: bool,
-    #[command(flatten)]
-    machine: MachineArgument,
 }
 
 #[derive(Debug, Clone, PartialEq)]
@@ -65,9 +62,6 @@ struct Assignment {
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
-    if let Some(destination) = arguments.machine.destination()? {
-        return destination.run();
-    }
     match &arguments.what {
         None => list(arguments, None),
         Some(What::Name(name)) => list(arguments, Some(name)),

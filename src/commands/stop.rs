@@ -4,7 +4,6 @@ use anyhow::bail;
 use clap::Args;
 use serde_json::json;
 
-use super::elsewhere::MachineArgument;
 use super::{Outcome, completions, print_line};
 use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, pick_starting_graph, running_graphs};
 use blindgrasp_graph::control::{Reply, Request};
@@ -14,7 +13,7 @@ use blindgrasp_operator::diagnostics::print_diagnostic;
 #[derive(Debug, Args)]
 #[command(after_help = "Example: blindgrasp stop grasp_gate\n\n\
                         Samples in flight are decided first. Ctrl-C ends the wait only; the graph still stops.\n\
-                        Of a graph on several machines, the part here is stopped, and with --machine another one.")]
+                        Of a graph on several machines, the part here is stopped.")]
 pub(super) struct Arguments {
     /// Graph [default: the only one running]
     #[arg(add = completions::graphs())]
@@ -25,14 +24,9 @@ pub(super) struct Arguments {
     /// Print JSON
     #[arg(long)]
     json: bool,
-    #[command(flatten)]
-    machine: MachineArgument,
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
-    if let Some(destination) = arguments.machine.destination()? {
-        return destination.run();
-    }
     let graphs = if arguments.all { running_graphs() } else { vec![pick_starting_graph(arguments.graph.as_deref())?] };
     if graphs.is_empty() {
         print_diagnostic("no graph is running");

@@ -1,7 +1,7 @@
 //! `blindgrasp swap`
 
 use std::collections::{BTreeMap, HashMap};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
@@ -9,14 +9,13 @@ use anyhow::{Context, anyhow, bail};
 use clap::Args;
 use serde::Serialize;
 
-use super::elsewhere::{MachineArgument, is_over_ssh};
 use super::{Outcome, completions, number_in, percent, print_line, secs_in, stop_signal};
 use blindgrasp_cli::graph_file::{refuse_misfit, shipped};
 use blindgrasp_graph::client::observer::{ObservedEdge, Observer, Sink, can_observe};
 use blindgrasp_graph::client::shadow_comparison::{
     ComparisonReport, Latency, PromotionLimits, Saying, ShadowComparison, Side, objections,
 };
-use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, pick_graph, status};
+use blindgrasp_graph::client::{ANSWER_LIMIT, ClientError, Connection, pick_graph};
 use blindgrasp_graph::control::{Reply, Request, ShadowOutput, SwapRequest, SwappedNode};
 use blindgrasp_graph::log::printable;
 use blindgrasp_messages::Record;
@@ -42,7 +41,6 @@ const MAX_PRINTED: usize = 20;
 #[command(after_help = "Examples: blindgrasp swap encoder classifier --set model=models/new.json\n          \
                         blindgrasp swap classifier --run ./my_classifier --shadow 30 \
                         --min-agreement 0.99 --max-latency-p99-us 500\n\n\
-                        With --machine, paths in --run and --set are paths there, relative to the dataflow file's folder.\n\
                         Ctrl-C abandons the swap. Exit code 1 if the old operator goes on or came back.")]
 pub(super) struct Arguments {
     /// Nodes to swap; several are handed over at one sample
@@ -79,8 +77,6 @@ pub(super) struct Arguments {
     /// Arguments for the program of --run; takes all that follows
     #[arg(long, value_name = "ARG", num_args = 0.., allow_hyphen_values = true, requires = "run")]
     args: Option<Vec<String>>,
-    #[command(flatten)]
-    machine: MachineArgument,
 }
 
 /// With one of these limits, a shadow comparison that keeps all of them at every output ends in the swap.
@@ -130,15 +126,8 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     if let Some(file) = arguments.nodes.iter().find(|node| !is_name(node)) {
         bail!("'{file}' is no name of a node: a model is given by --set model=FILE, a program by --run FILE");
     }
-    let mut request = request(arguments)?;
-    if let Some(destination) = arguments.machine.destination()? {
-        return destination.run();
-    }
+    let request = request(arguments)?;
     let graph = pick_graph(arguments.graph.as_deref())?;
-    if is_over_ssh() {
-        // The caller knows the dataflow file, not the folder in which ssh starts a command.
-        request.folder = status(&graph)?.file.parent().unwrap_or(Path::new("/")).to_path_buf();
-    }
     refuse_misfit(&graph, &request)?;
     let request = found_here(request)?;
     let stop = stop_signal()?;

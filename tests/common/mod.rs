@@ -24,7 +24,7 @@ pub(crate) const HAND: &str = "hands/barrett-bh8-280.yaml";
 
 /// For [`dataflow`]: the default graph with its hand side on one machine and its brain on another.
 pub(crate) const ON_TWO_MACHINES: [(&str, &str); 6] = [
-    ("operators:\n", "machines:\n  robot: {}\n  brain: {listen: unix/gate, ssh: user@brain.local}\noperators:\n"),
+    ("operators:\n", "machines:\n  robot: {}\n  brain: {listen: unix/gate}\noperators:\n"),
     ("  recorded_source:\n", "  recorded_source:\n    on: robot\n"),
     ("  contacts:\n", "  contacts:\n    on: robot\n"),
     ("  encoder:\n", "  encoder:\n    on: brain\n"),

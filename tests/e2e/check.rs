@@ -151,9 +151,9 @@ fn machines_and_the_edges_between_them_are_shown() {
         shown.lines().map(|line| line.split("  ").map(str::trim).filter(|entry| !entry.is_empty()).collect()).collect();
     for expected in [
         &["graph 'grasp_gate': 5 nodes, 4 edges, 2 machines, 2 edges between them"][..],
-        &["machine", "listens at", "for ssh"],
-        &["robot", "-", "robot"],
-        &["brain", "unix/gate", "user@brain.local"],
+        &["machine", "listens at"],
+        &["robot", "-"],
+        &["brain", "unix/gate"],
         &["link: cut off after 150 ms, buffer 8192 samples"],
         &["node", "machine", "restart", "heartbeat", "program"],
         &["edge", "over Zenoh", "type", "policy", "capacity", "deadline"],

@@ -9,7 +9,6 @@ use std::process::{Child, Command, Stdio};
 use std::sync::{Arc, Mutex};
 
 use crate::common::{Graph, NODES, blindgrasp, fails, json_lines, run, signal, text, unique_name, wait_until};
-use crate::over_ssh::Sshd;
 use rustix::process::Signal;
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use rustix::termios::{Winsize, tcsetwinsize};
@@ -274,17 +273,4 @@ fn top_without_a_graph_is_refused() {
     assert_eq!(top.child.wait().expect("waited").code(), Some(1));
     run(&["top", "--interval", "0", "--json"], 2);
     run(&["top", "-n", "0", "--json"], 2);
-}
-
-#[test]
-fn a_person_watches_a_graph_over_ssh() {
-    let Some(sshd) = Sshd::start() else { return };
-    let graph = Graph::fast();
-    let there = [&graph.name, "--machine", "brain", "--interval", "0.2"];
-    let mut top = OnTerminal::start(sshd.blindgrasp(), &there, 24);
-    top.wait_for(" LIFT      ");
-    // Ctrl-C: on the terminal of the other machine.
-    top.press("\x03");
-    top.finish();
-    graph.stop();
 }

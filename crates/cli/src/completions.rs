@@ -22,14 +22,6 @@ pub fn graphs() -> ArgValueCandidates {
     ArgValueCandidates::new(|| candidates(running_graphs()))
 }
 
-/// The other machines of the running graphs.
-pub fn machines() -> ArgValueCandidates {
-    of_status(|status| {
-        let peers = status.link.iter().flat_map(|link| &link.peers);
-        peers.map(|peer| peer.machine.clone()).collect()
-    })
-}
-
 pub fn nodes() -> ArgValueCandidates {
     of_status(|status| status.nodes.iter().map(|node| node.node.clone()).collect())
 }

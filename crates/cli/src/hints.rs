@@ -9,8 +9,8 @@ use blindgrasp_operator::text::{did_you_mean, quote};
 use clap::error::{ContextKind, ContextValue, ErrorKind};
 use clap::{Arg, Command};
 
-/// The words of ROS 2, Docker, systemd, git and dora, each with the command that does it here.
-pub const WORDS: [(&str, &str); 40] = [
+/// The words of ROS 2, Docker and systemd, each with the command that does it here.
+pub const WORDS: [(&str, &str); 16] = [
     ("launch", "run"),
     ("node", "ps"),
     ("topic echo", "echo NODE/PORT"),
@@ -23,33 +23,9 @@ pub const WORDS: [(&str, &str); 40] = [
     ("bag record", "record --out FILE"),
     ("bag play", "replay RECORDING"),
     ("bag", "info RECORDING"),
-    ("play", "replay RECORDING"),
-    ("pkg", "new operator NAME"),
-    ("up", "run"),
-    ("down", "stop"),
     ("ls", "ps"),
-    ("kill", "stop"),
-    ("rm", "stop"),
-    ("stats", "top"),
-    ("inspect", "info FILE"),
-    ("start", "run"),
     ("restart", "swap NODE"),
-    ("reload", "swap NODE"),
     ("status", "ps"),
-    ("enable", "run --detach"),
-    ("daemon", "run --detach"),
-    ("list", "ps"),
-    ("check", "run --check FILE"),
-    ("build", "run"),
-    ("attach", "top"),
-    ("destroy", "stop --all"),
-    ("create", "init FOLDER"),
-    ("graph", "view"),
-    ("diff", "test RECORDING"),
-    ("show", "info FILE"),
-    ("config", "set"),
-    ("convert", "export RECORDING --out FILE"),
-    ("plot", "view FILE"),
     ("version", "--version"),
 ];
 

@@ -85,8 +85,6 @@ pub enum Outcome {
     Done,
     /// It ran to its end, but samples were lost.
     FinishedWithLoss,
-    /// It ran on another machine and ended with this exit code. What failed was told there.
-    OfOtherMachine(u8),
 }
 
 impl Outcome {
@@ -95,12 +93,11 @@ impl Outcome {
         if is_lossy { Outcome::FinishedWithLoss } else { Outcome::Done }
     }
 
-    /// 0 or 3, or that of the other machine.
+    /// 0 or 3.
     pub fn exit_code(self) -> ExitCode {
         match self {
             Outcome::Done => ExitCode::SUCCESS,
             Outcome::FinishedWithLoss => ExitCode::from(3),
-            Outcome::OfOtherMachine(code) => ExitCode::from(code),
         }
     }
 }

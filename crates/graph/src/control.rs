@@ -208,9 +208,6 @@ pub struct GraphStatus {
     /// The link to the other machines, if the graph runs on several.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub link: Option<LinkStatus>,
-    /// Destinations of `ssh` of the other machines for which the dataflow file names one.
-    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
-    pub ssh_hosts: BTreeMap<String, String>,
 }
 
 /// The values of iceoryx2's configuration with which its own tools see a graph, as `global.root-path` and `global.prefix`.

@@ -89,7 +89,6 @@ pub fn made_status(graph: &str) -> GraphStatus {
             ages: serde_json::from_str("[[102400,900],[1024000,90]]").expect("ages"),
         }],
         link: None,
-        ssh_hosts: std::collections::BTreeMap::new(),
     }
 }
 

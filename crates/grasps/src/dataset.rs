@@ -35,6 +35,8 @@ pub enum DatasetError {
     Hand(#[from] HandError),
     #[error(transparent)]
     OtherHand(#[from] OtherHand),
+    #[error("expected a recording")]
+    NoRecording,
     #[error("recording {}: {message}", path.display())]
     Unusable { path: PathBuf, message: String },
     #[error(
@@ -78,6 +80,25 @@ pub fn hand_of(recording: &Path, hand: Option<&Path>) -> Result<Hand, DatasetErr
     };
     check_hand(recording, &reader, &hand)?;
     Ok(hand)
+}
+
+/// The one hand of several recordings, as [`hand_of`] gives it.
+///
+/// # Errors
+/// As those of [`hand_of`]; there is no recording, or two of them have layouts of one hand that differ, as in thresholds.
+pub fn hand_of_all(recordings: &[PathBuf], hand: Option<&Path>) -> Result<Hand, DatasetError> {
+    let [first, others @ ..] = recordings else { return Err(DatasetError::NoRecording) };
+    let found = hand_of(first, hand)?;
+    let (None, Some(built_in)) = (hand, Hand::built_in(&found.name)) else { return Ok(found) };
+    for path in others {
+        let own = attached_hand(path, &built_in).unwrap_or(built_in.clone());
+        if own.id() == found.id() && own.description_id() != found.description_id() {
+            let first = first.display();
+            let message = format!("its pad layout differs from that of {first}: say with --hand which one counts");
+            return Err(DatasetError::Unusable { path: path.clone(), message });
+        }
+    }
+    Ok(found)
 }
 
 /// The hand whose files are attached to a recording, if its layout is not that of the built-in hand.

@@ -4,16 +4,23 @@ use std::collections::BTreeMap;
 use std::io::Write;
 use std::path::PathBuf;
 
+use csv::StringRecord;
+
 use crate::dataset::{DatasetError, Grasp, check_once, labels_of, read_grasps};
 use crate::reading::{SeenReadings, Settled, check_classes, note_reading};
 use blindgrasp_messages::{Fault, GraspTruth};
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::model::Model;
+use blindgrasp_stages::training_summary::ReadingId;
 
-/// How many grasps a table of features has, and how many were left out, by reason.
-#[derive(Debug, Clone, PartialEq, Eq)]
+/// The columns before those of the values.
+pub const COLUMNS: [&str; 7] =
+    ["recording", "grasp_id", "object", "object_class", "stable", "hand_id", "dictionary_id"];
+
+/// The readings of a table's rows, by recording, and how many grasps were left out, by reason.
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct FeatureTable {
-    pub n_rows: usize,
+    pub readings: Vec<Vec<ReadingId>>,
     pub n_excluded: BTreeMap<String, usize>,
 }
 
@@ -28,7 +35,7 @@ pub enum FeatureTableError {
     Io(#[from] std::io::Error),
 }
 
-/// Writes a row (CSV) for each grasp with a label and a contact. A row has where the grasp was recorded, its label, the
+/// Writes a row (CSV) for each grasp with a label and a contact, of the recordings whose index `is_own`. A row has where the grasp was recorded, its label, the
 /// identities of hand and features, then the features of its first settled frame, each under its name. The limits of the
 /// model's training data are not applied.
 ///
@@ -38,18 +45,18 @@ pub fn write_feature_table(
     hand: &Hand,
     model: &Model,
     recordings: &[PathBuf],
+    is_own: impl Fn(usize) -> bool,
     to: impl Write,
 ) -> Result<FeatureTable, FeatureTableError> {
     check_once(recordings)?;
     labels_of(recordings)?;
     let identity = [format!("{:016x}", model.hand.id), format!("{:016x}", model.dictionary_id())];
     let mut table = csv::Writer::from_writer(to);
-    let names =
-        ["recording", "grasp_id", "object", "object_class", "stable", "hand_id", "dictionary_id"].map(String::from);
-    table.write_record(names.into_iter().chain(model.features.value_names(hand)))?;
-    let (mut n_rows, mut n_excluded) = (0, BTreeMap::new());
+    table.write_record(COLUMNS.map(String::from).into_iter().chain(model.features.value_names(hand)))?;
+    let FeatureTable { mut readings, mut n_excluded } = FeatureTable::default();
     let (mut values, mut objects, mut seen) = (Vec::new(), Vec::new(), SeenReadings::new());
-    for (recording_idx, path) in recordings.iter().enumerate() {
+    for (recording_idx, path) in recordings.iter().enumerate().filter(|(idx, _)| is_own(*idx)) {
+        let mut of_rows = Vec::new();
         for Grasp { grasp_id, value, truth } in read_grasps(path, hand, |_, frames| Settled::of(hand, &frames))? {
             let (settled, truth) = match usable(value, truth, recording_idx, &mut seen) {
                 Ok(usable) => usable,
@@ -66,12 +73,41 @@ pub fn write_feature_table(
             let (recording, stable) = (path.display().to_string(), u8::from(truth.stable).to_string());
             let row = [recording, grasp_id.to_string(), truth.object, truth.object_class, stable];
             table.write_record(row.into_iter().chain(identity.clone()).chain(values.iter().map(f64::to_string)))?;
-            n_rows += 1;
+            of_rows.push(settled.reading_id);
         }
+        readings.push(of_rows);
     }
     check_classes(objects.iter().map(|(object, class)| (object.as_str(), class.as_str())))?;
     table.flush()?;
-    Ok(FeatureTable { n_rows, n_excluded })
+    Ok(FeatureTable { readings, n_excluded })
+}
+
+/// Writes the table of the whole from the header of one and the rows of all shards, each with its reading. Of grasps with one
+/// reading, the first one has a row, as in [`write_feature_table`].
+///
+/// # Errors
+/// An object is of two classes, or the table cannot be written.
+pub fn merge_feature_rows(
+    header: &StringRecord,
+    rows: Vec<(ReadingId, StringRecord)>,
+    to: impl Write,
+) -> Result<FeatureTable, FeatureTableError> {
+    check_classes(rows.iter().map(|(_, row)| (&row[2], &row[3])))?;
+    let mut table = csv::Writer::from_writer(to);
+    table.write_record(header)?;
+    let (mut merged, mut seen, mut of_rows) = (FeatureTable::default(), SeenReadings::new(), Vec::new());
+    for (reading, row) in rows {
+        match note_reading(&mut seen, reading, 0, &row[4] == "1") {
+            Ok(()) => {
+                table.write_record(&row)?;
+                of_rows.push(reading);
+            }
+            Err(reason) => *merged.n_excluded.entry(reason.into()).or_default() += 1,
+        }
+    }
+    table.flush()?;
+    merged.readings.push(of_rows);
+    Ok(merged)
 }
 
 /// The settled frame and the label of a grasp, or the reason why it is left out.

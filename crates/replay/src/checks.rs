@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::path::Path;
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use super::comparison::{ComparedEdge, EdgeComparison};
 use super::expectations::Expectations;
@@ -17,7 +17,7 @@ use blindgrasp_recording::{Record, RecordingError, RecordingReader};
 const FEWEST_FOR_ACCURACY: usize = 20;
 
 /// The outcome of one check.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Serialize, Deserialize)]
 pub struct Check {
     /// A topic, or an expectation's key.
     pub name: String,
@@ -71,7 +71,7 @@ impl Tally {
 }
 
 /// A grasp whose action is another one than before.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ChangedDecision {
     pub grasp_id: u64,
     /// Action and reason before; `None` if there was no decision.

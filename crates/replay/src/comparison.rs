@@ -54,7 +54,7 @@ pub struct Coverage {
 }
 
 /// The result of comparing an edge.
-#[derive(Debug, Clone, Default, PartialEq, Serialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct EdgeComparison {
     pub topic: String,
     pub n_recorded: u64,
@@ -71,7 +71,7 @@ pub struct EdgeComparison {
 }
 
 /// A difference between recording and replay.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Difference {
     pub grasp_id: u64,
     /// The sample's recorded number.
@@ -80,7 +80,7 @@ pub struct Difference {
     pub what: What,
 }
 
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "what", rename_all = "snake_case")]
 pub enum What {
     /// The sample is only in the recording.

@@ -11,7 +11,7 @@ use super::{
     Outcome, check_output, check_page, completions, number_in, percent, print_line, print_text, word, write_out,
     write_report,
 };
-use blindgrasp_grasps::dataset::{hand_of, label_line, labels_of};
+use blindgrasp_grasps::dataset::{hand_of_all, label_line, labels_of};
 use blindgrasp_learning::evaluation::baselines::Baselines;
 use blindgrasp_learning::evaluation::cross_validation::{HeldOutOptions, judge_held_out};
 use blindgrasp_learning::evaluation::looks::Look;
@@ -135,8 +135,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     if let Some(folder) = arguments.figures.as_ref().filter(|folder| folder.is_dir()) {
         check_output(&folder.join(PREDICTIONS_FILE), &inputs)?;
     }
-    let first = recordings.first().context("expected a recording")?;
-    let hand = hand_of(first, arguments.hand.as_deref())?;
+    let hand = hand_of_all(&recordings, arguments.hand.as_deref())?;
     hand.warnings().iter().for_each(|warning| print_diagnostic(warning));
     let origin = Origin {
         command: command_line(),

@@ -2,13 +2,13 @@
 
 use std::path::{Path, PathBuf};
 
-use anyhow::{Context, bail};
+use anyhow::bail;
 use clap::{Args, Subcommand};
 use serde_json::json;
 
 use super::train::{is_of_the_papers_label, probe_lines, threshold_line};
 use super::{Outcome, check_new, completions, number_in, percent, print_line, print_text};
-use blindgrasp_grasps::dataset::{hand_of, label_line};
+use blindgrasp_grasps::dataset::{hand_of_all, label_line};
 use blindgrasp_learning::plain_rule::plain_rule;
 use blindgrasp_learning::training::{adapt, counts};
 use blindgrasp_messages::Phase;
@@ -133,8 +133,7 @@ fn make_rule(arguments: &RuleArguments) -> anyhow::Result<Outcome> {
 
 fn adapt_model(arguments: &AdaptArguments) -> anyhow::Result<Outcome> {
     let recordings = recordings_in(&arguments.recordings)?;
-    let first = recordings.first().context("expected a recording")?;
-    let hand = hand_of(first, arguments.hand.as_deref())?;
+    let hand = hand_of_all(&recordings, arguments.hand.as_deref())?;
     let inputs = [recordings.as_slice(), std::slice::from_ref(&arguments.model)].concat();
     check_new(&arguments.out, &inputs, arguments.overwrite)?;
     let robots: Vec<String> = recordings.iter().map(|path| robot_of(path, &arguments.recordings)).collect();

@@ -2,13 +2,13 @@
 
 use std::path::PathBuf;
 
-use anyhow::{Context, bail};
+use anyhow::bail;
 use clap::{Args, Subcommand};
 use indicatif::ProgressBar;
 use serde_json::json;
 
 use super::{Outcome, check_new, completions, print_line, print_text};
-use blindgrasp_grasps::dataset::hand_of;
+use blindgrasp_grasps::dataset::hand_of_all;
 use blindgrasp_learning::sensors::{alarms, learn, read};
 use blindgrasp_operator::text::counted;
 use blindgrasp_recording::recordings_in;
@@ -77,7 +77,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
 
 fn learn_check(arguments: &LearnArguments) -> anyhow::Result<Outcome> {
     let recordings = recordings_in(&arguments.recordings)?;
-    let hand = hand_of(recordings.first().context("expected a recording")?, arguments.hand.as_deref())?;
+    let hand = hand_of_all(&recordings, arguments.hand.as_deref())?;
     check_new(&arguments.out, &recordings, arguments.overwrite)?;
     let grasps = read(&hand, &recordings)?;
     let bar = ProgressBar::new(0);
@@ -100,7 +100,7 @@ fn learn_check(arguments: &LearnArguments) -> anyhow::Result<Outcome> {
 
 fn check(arguments: &CheckArguments) -> anyhow::Result<Outcome> {
     let recordings = recordings_in(&arguments.recordings)?;
-    let hand = hand_of(recordings.first().context("expected a recording")?, arguments.hand.as_deref())?;
+    let hand = hand_of_all(&recordings, arguments.hand.as_deref())?;
     let check = SensorCheck::load(&arguments.check, &hand)?;
     let grasps = read(&hand, &recordings)?;
     let alarms = alarms(&check, &hand, &grasps);

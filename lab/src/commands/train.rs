@@ -7,7 +7,7 @@ use clap::Args;
 
 use super::model::print_model;
 use super::{Outcome, check_new, completions, number_in, percent};
-use blindgrasp_grasps::dataset::hand_of;
+use blindgrasp_grasps::dataset::hand_of_all;
 use blindgrasp_grasps::reading::SELF_CONTACT;
 use blindgrasp_learning::training::{Aim, Examples, TrainingOptions, TrainingSummary, train};
 use blindgrasp_messages::Fault;
@@ -75,8 +75,7 @@ pub(super) struct Arguments {
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let recordings = recordings_in(&arguments.recordings)?;
-    let first = recordings.first().context("expected a recording")?;
-    let hand = hand_of(first, arguments.hand.as_deref())?;
+    let hand = hand_of_all(&recordings, arguments.hand.as_deref())?;
     check_new(&arguments.out, &recordings, arguments.overwrite)?;
     if arguments.out.extension().is_some_and(|extension| extension == "mcap") {
         let out = arguments.out.display();

@@ -54,6 +54,11 @@ fn grasps_are_read_with_the_thresholds_of_the_hand_that_made_them() {
     };
     assert_eq!(felt(&[]), felt(&["--hand", "hands/dull.yaml"]));
     assert_ne!(felt(&[]), felt(&["--hand", "barrett-bh8-280"]));
+    // Recordings of two layouts have no thresholds in common.
+    let both = ["info", "--full", "dull.mcap", "recordings/held-out.mcap"];
+    let (_, errors) = run_in(folder.path(), &both, 1);
+    assert!(errors.contains("differs from that of dull.mcap: say with --hand which one counts"), "{errors}");
+    run_in(folder.path(), &[&both[..], &["--hand", "hands/dull.yaml"]].concat(), 0);
 }
 
 #[test]

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
 use rayon::prelude::*;
-use serde::Serialize;
+use serde::Deserialize;
 use serde_json::json;
 
 use super::faults::hand_of;
@@ -40,11 +40,12 @@ pub(super) struct Runner<'a> {
 }
 
 /// The outcome of a recording.
-#[derive(Debug, Serialize)]
+#[derive(Debug, Deserialize)]
 pub(super) struct Case {
     pub(super) recording: PathBuf,
     pub(super) checks: Vec<Check>,
     /// The grasps whose action is another one than recorded.
+    #[serde(rename = "changed_actions")]
     pub(super) changed: Vec<ChangedDecision>,
     /// The samples that could not be compared, and why.
     pub(super) notes: Vec<String>,

@@ -18,7 +18,7 @@ use self::case::{Case, Runner};
 use self::scratch::Scratch;
 use self::sweep::Sweep;
 use super::{Outcome, check_output, stop_requests};
-use blindgrasp_cli::shard::Shard;
+use blindgrasp_cli::shard::{Place, Shard};
 use blindgrasp_graph::dataflow::Override;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_replay::expectations;
@@ -70,8 +70,12 @@ pub(super) struct Arguments {
     #[arg(long)]
     update: bool,
     /// Test only every N-th recording, from the I-th on (0/N to N-1/N).
-    #[arg(long, value_name = "I/N", default_value = "0/1", hide_default_value = true)]
-    shard: Shard,
+    #[arg(long, value_name = "I/N")]
+    shard: Option<Shard>,
+    /// Test nothing: report the tests of the whole, from the files with the JSON of each shard.
+    #[arg(long, value_name = "FILE", num_args = 1..,
+          conflicts_with_all = ["recordings", "replace", "overrides", "init", "sweep", "faults", "update", "shard", "keep"])]
+    merge: Vec<PathBuf>,
     /// Keep the recording of each replay in this folder, under the recording's name.
     #[arg(long, value_name = "DIR")]
     keep: Option<PathBuf>,
@@ -81,12 +85,19 @@ pub(super) struct Arguments {
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
+    if !arguments.merge.is_empty() {
+        check_outputs(arguments, &arguments.merge)?;
+        return report(arguments, &report::merged(&arguments.merge)?, None);
+    }
     let recordings = match arguments.recordings.as_slice() {
         [] if arguments.init => init::without_expectations(&arguments.dataflow)?,
         [] => with_expectations(&arguments.dataflow)?,
         named => named.to_vec(),
     };
-    let recordings = arguments.shard.of(recordings);
+    let overrides = format!("{:?}", arguments.overrides);
+    let settings = (std::fs::read(&arguments.dataflow).ok(), &arguments.replace, overrides);
+    let mut place = arguments.shard.map(|shard| Place::new(shard, settings, &recordings));
+    let recordings = arguments.shard.unwrap_or_default().of(recordings);
     check_outputs(arguments, &recordings)?;
     let n_stops = stop_requests()?;
     let runner = Runner {
@@ -115,21 +126,30 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         }
         cases.push(case);
     }
+    if let Some(place) = &mut place {
+        place.n_lines = vec![1; recordings.len()];
+    }
+    let reported = report(arguments, &cases, place);
+    if cases.len() < recordings.len() {
+        let n_failed = cases.iter().filter(|case| !case.has_passed()).count();
+        bail!("stopped after {} of {} recordings, of which {n_failed} failed", cases.len(), recordings.len());
+    }
+    reported
+}
+
+/// Fails if a test did.
+fn report(arguments: &Arguments, cases: &[Case], place: Option<Place>) -> anyhow::Result<Outcome> {
     if let Some(junit) = &arguments.junit {
-        report::write_junit(junit, &cases)?;
+        report::write_junit(junit, cases)?;
     }
     if let Some(summary) = &arguments.summary {
-        report::append_markdown(summary, &cases)?;
+        report::append_markdown(summary, cases)?;
     }
-    let printed = report::print_summary(&cases, arguments.json);
+    let printed = report::print_summary(cases, arguments.json, place);
     if let Some(folder) = &arguments.keep {
         print_diagnostic(&format!("kept in {}", folder.display()));
     }
-    let n_failed = cases.iter().filter(|case| !case.has_passed()).count();
-    if cases.len() < recordings.len() {
-        bail!("stopped after {} of {} recordings, of which {n_failed} failed", cases.len(), recordings.len());
-    }
-    match n_failed {
+    match cases.iter().filter(|case| !case.has_passed()).count() {
         0 => printed.map(|()| Outcome::Done),
         n_failed => bail!("{n_failed} of {} recordings failed", cases.len()),
     }

@@ -1,16 +1,19 @@
 //! The outcome of the tests: for people, for scripts, for continuous integration.
 
 use std::io::Write;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use quick_xml::events::BytesText;
 use quick_xml::writer::Writer;
+use serde::Deserialize;
 use serde_json::json;
 
 use super::case::Case;
 use super::scratch::file_name;
 use crate::commands::{print_line, print_text, write_out};
+use blindgrasp_cli::shard::{Place, merge_files};
+use blindgrasp_messages::files::read_regular;
 use blindgrasp_operator::text::counted;
 use blindgrasp_replay::checks::Check;
 
@@ -26,7 +29,7 @@ pub(super) fn print_case(case: &Case) -> anyhow::Result<()> {
 }
 
 /// Prints a table, and how many recordings passed.
-pub(super) fn print_summary(cases: &[Case], is_json: bool) -> anyhow::Result<()> {
+pub(super) fn print_summary(cases: &[Case], is_json: bool, place: Option<Place>) -> anyhow::Result<()> {
     let n_failed = cases.iter().filter(|case| !case.has_passed()).count();
     let n_passed = cases.len() - n_failed;
     if is_json {
@@ -39,7 +42,10 @@ pub(super) fn print_summary(cases: &[Case], is_json: bool) -> anyhow::Result<()>
                 })
             })
             .collect();
-        let line = json!({"recordings": cases, "n_passed": n_passed, "n_failed": n_failed});
+        let mut line = json!({"recordings": cases, "n_passed": n_passed, "n_failed": n_failed});
+        if let Some(place) = place {
+            line["place"] = serde_json::to_value(place)?;
+        }
         return Ok(print_text(&serde_json::to_string_pretty(&line)?)?);
     }
     print_line("")?;
@@ -63,6 +69,20 @@ pub(super) fn print_summary(cases: &[Case], is_json: bool) -> anyhow::Result<()>
     }
     print_line(&format!("{}: {n_passed} passed, {n_failed} failed", counted(cases.len(), "recording")))?;
     Ok(())
+}
+
+/// The outcomes of all recordings, from the JSON of all shards.
+pub(super) fn merged(paths: &[PathBuf]) -> anyhow::Result<Vec<Case>> {
+    #[derive(Deserialize)]
+    struct Printed {
+        recordings: Vec<Case>,
+        place: Place,
+    }
+    merge_files(paths, |path| {
+        let printed = serde_json::from_str(&read_regular(path)?);
+        let Printed { recordings, place } = printed.context("expected the JSON of test --shard I/N --json")?;
+        Ok((place, recordings))
+    })
 }
 
 /// Writes JUnit XML: a test suite per recording, a test case per check.

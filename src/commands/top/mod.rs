@@ -12,7 +12,6 @@ use clap::Args;
 use rustix::process::{Signal, getpid, kill_process};
 
 use self::page::lines;
-use super::elsewhere::MachineArgument;
 use super::{Outcome, completions, print_line, secs_in, stop_signal};
 use blindgrasp_graph::client::activity::{Look, measure};
 use blindgrasp_graph::client::poller::Poller;
@@ -38,8 +37,6 @@ pub(super) struct Arguments {
     /// End after so many intervals
     #[arg(short = 'n', long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     iterations: Option<u64>,
-    #[command(flatten)]
-    machine: MachineArgument,
 }
 
 /// Signals and answers are waited for so long at a time.
@@ -53,9 +50,6 @@ const CURSOR_SHOWN: &str = "\n\x1b[?7h\x1b[?25h";
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let is_on_terminal = !arguments.json && std::io::stdout().is_terminal();
-    if let Some(destination) = arguments.machine.destination()? {
-        return if is_on_terminal { destination.run_on_terminal() } else { destination.run() };
-    }
     let graph = pick_graph(arguments.graph.as_deref())?;
     let (mut poller, first) = Poller::connect(&graph)?;
     let screen = if is_on_terminal { Some(Screen::open()?) } else { None };

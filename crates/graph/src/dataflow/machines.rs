@@ -22,9 +22,6 @@ pub struct Machine {
     /// The Zenoh endpoints where it listens, like `tls/192.168.1.10:7447`. A machine without one connects to machines
     /// that listen.
     pub listen: Vec<String>,
-    /// Where `--machine` finds it: a destination of `ssh`, like `user@host`. Without one, that is its name.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub ssh: Option<String>,
 }
 
 /// How the machines of a graph are linked.
@@ -55,8 +52,6 @@ pub struct LocalView {
     /// Output ports of other machines that are read here, as `NODE/PORT`, and whether a source on another machine is
     /// among those that they depend on: then this machine's part goes on until they end.
     pub imports: Vec<(String, bool)>,
-    /// Destinations of `ssh` of the other machines for which the file names one.
-    pub ssh_hosts: BTreeMap<String, String>,
     /// The nodes that run on other machines, each with its machine.
     pub elsewhere: BTreeMap<String, String>,
 }

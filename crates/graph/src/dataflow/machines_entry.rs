@@ -12,7 +12,7 @@ use crate::dataflow::yaml::{Content, Entry, Text, Value};
 use blindgrasp_operator::param::ParamKind;
 use blindgrasp_operator::text::quote;
 
-pub(super) const MACHINE_KEYS: [&str; 2] = ["listen", "ssh"];
+pub(super) const MACHINE_KEYS: [&str; 1] = ["listen"];
 pub(super) const LINK_KEYS: [&str; 5] = ["router", "keys", "insecure", "deadline_ms", "buffer"];
 /// Each machine is linked to each that it shares an edge with.
 const MAX_MACHINES: usize = 64;
@@ -37,7 +37,6 @@ pub(super) struct MachineEntry {
     listen: Vec<(Text, Endpoint)>,
     /// Whether the file wants it to listen, rightly written or not.
     pub(super) listens: bool,
-    ssh: Option<String>,
 }
 
 #[derive(Debug, Clone, Default)]
@@ -61,11 +60,10 @@ impl MachinesEntry {
 
     /// As a graph has them; a path is relative to `folder`.
     pub(super) fn settle(&self, link: &LinkEntry, folder: &Path) -> Machines {
-        let machines = self.machines.iter().map(|machine| Machine {
-            name: machine.name.text.clone(),
-            listen: as_written(&machine.listen),
-            ssh: machine.ssh.clone(),
-        });
+        let machines = self
+            .machines
+            .iter()
+            .map(|machine| Machine { name: machine.name.text.clone(), listen: as_written(&machine.listen) });
         let link = LinkSettings {
             router: as_written(&link.router),
             keys: link.keys.as_ref().map(|keys| absolute(folder, keys)),
@@ -103,7 +101,7 @@ fn read_machine(entry: Entry, diagnostics: &mut Diagnostics) -> MachineEntry {
     let name = entry.key;
     check_name(&name, "machine", diagnostics);
     let machine_name = format!("machine {}", quote(&name.text));
-    let mut machine = MachineEntry { listen: Vec::new(), listens: false, ssh: None, name };
+    let mut machine = MachineEntry { listen: Vec::new(), listens: false, name };
     let Some(entries) = entries_or_nothing(entry.value, &machine_name, diagnostics) else {
         machine.listens = true;
         return machine;
@@ -116,7 +114,6 @@ fn read_machine(entry: Entry, diagnostics: &mut Diagnostics) -> MachineEntry {
                 machine.listens = texts.as_ref().is_none_or(|texts| !texts.is_empty());
                 machine.listen = read_endpoints(texts, &what, diagnostics);
             }
-            "ssh" => machine.ssh = read_ssh(&value, &what, diagnostics),
             _ => {
                 unknown_key(&key, &format!(" in {machine_name}"), &MACHINE_KEYS, diagnostics);
                 // It may have been meant to be 'listen'.
@@ -168,24 +165,6 @@ pub(super) fn read_link(entry: Entry, diagnostics: &mut Diagnostics) -> LinkEntr
         }
     }
     link
-}
-
-/// A destination of `ssh`, which goes into its command line.
-fn read_ssh(value: &Value, what: &str, diagnostics: &mut Diagnostics) -> Option<String> {
-    match &value.content {
-        Content::Scalar { text, .. } if !value.is_null() && is_ssh_host(text) => Some(text.clone()),
-        _ => {
-            let message = format!("{what} must be a destination of ssh, found {}", value.found());
-            let help = "write it like user@192.168.1.10, or as a host of ~/.ssh/config".to_owned();
-            diagnostics.push_with_help(value.at, message, Some(help));
-            None
-        }
-    }
-}
-
-/// Whether `ssh` takes a text for a destination: one that begins with '-' would be an option.
-pub fn is_ssh_host(text: &str) -> bool {
-    !text.is_empty() && !text.starts_with('-') && text.chars().all(|char| char.is_ascii_graphic())
 }
 
 /// A text, or a list of texts.

@@ -36,7 +36,7 @@
 //! ```yaml
 //! machines:
 //!   robot: {}                      # listens nowhere: it connects to those that do
-//!   brain: {listen: tls/192.168.1.10:7447, ssh: user@192.168.1.10}          # ssh: where --machine brain finds it
+//!   brain: {listen: tls/192.168.1.10:7447}
 //! link: {keys: keys, deadline_ms: 150, buffer: 8192}            # or router: tls/gateway:7447; insecure: true
 //! operators:
 //!   contacts: {on: robot, …}
@@ -89,7 +89,6 @@ pub use graph::{
     Node, Restart, RestartPolicy,
 };
 pub use machines::{LINK, LinkSettings, LocalView, Machine, Machines};
-pub use machines_entry::is_ssh_host;
 pub use process_options::{ProcessOptions, Scheduling, SchedulingPolicy};
 pub use program::Program;
 pub use schema::schema;

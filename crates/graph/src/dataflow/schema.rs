@@ -241,7 +241,6 @@ fn machines() -> Value {
             "additionalProperties": false,
             "properties": {
                 "listen": texts("Its address for the others: tls/HOST:PORT, unix/NAME or tcp/HOST:PORT"),
-                "ssh": {"type": "string", "description": "Where --machine finds it: a destination of ssh, like user@host"},
             },
         },
     })

@@ -1,6 +1,6 @@
 //! The launcher's knowledge of the other machines of its graph.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::time::Instant;
 
 use crate::dataflow::{LocalView, Node};
@@ -53,11 +53,6 @@ impl LinkBook {
     /// Whether this is one machine's part of a graph.
     pub(super) fn is_part(&self) -> bool {
         self.local.is_some()
-    }
-
-    /// Destinations of `ssh` of other machines.
-    pub(super) fn ssh_hosts(&self) -> BTreeMap<String, String> {
-        self.local.as_ref().map(|local| local.ssh_hosts.clone()).unwrap_or_default()
     }
 
     /// The other machine that runs a node.

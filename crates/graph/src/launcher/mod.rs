@@ -650,7 +650,6 @@ impl Launcher {
             edges: self.edges(),
             decisions: self.decisions.lock().unwrap_or_else(PoisonError::into_inner).clone(),
             link: life.link.status().cloned(),
-            ssh_hosts: life.link.ssh_hosts(),
         }
     }
 

@@ -63,11 +63,9 @@ pub fn local_graph(graph: &Graph, placement: &Placement, link_program: &Program)
         LocalError::Unknown { machine: placement.machine.clone(), known }
     })?;
     let mut nodes: Vec<Node> = graph.nodes.iter().filter(|node| is_on(node, &this.name)).cloned().collect();
-    let others = machines.machines.iter().filter(|machine| machine.name != this.name);
-    let ssh_hosts = others.filter_map(|machine| Some((machine.name.clone(), machine.ssh.clone()?))).collect();
     let elsewhere = graph.nodes.iter().filter(|node| !is_on(node, &this.name));
     let elsewhere = elsewhere.filter_map(|node| Some((node.id.clone(), node.machine.clone()?))).collect();
-    let mut view = LocalView { machine: this.name.clone(), imports: Vec::new(), ssh_hosts, elsewhere };
+    let mut view = LocalView { machine: this.name.clone(), imports: Vec::new(), elsewhere };
     if machines.machines.len() > 1 {
         let config = link_config(graph, machines, this, placement)?;
         view.imports = config
@@ -297,7 +295,6 @@ mod tests {
         let machine = |name: &str, listen: &[&str]| Machine {
             name: name.into(),
             listen: listen.iter().map(|endpoint| endpoint.to_string()).collect(),
-            ssh: (name == "brain").then(|| "user@brain.local".into()),
         };
         Graph {
             name: "gate".into(),
@@ -341,7 +338,6 @@ mod tests {
         // The predictions depend on robot's own source: robot's part ends when this source ends.
         let view = robot.local.expect("a view");
         assert_eq!(view.imports, [("classifier/prediction".to_owned(), false)]);
-        assert_eq!(view.ssh_hosts, [("brain".to_owned(), "user@brain.local".to_owned())].into());
         assert_eq!(view.elsewhere["histogram"], "brain");
 
         let brain = local_graph(&graph, &placement("brain"), &link_program()).expect("brain's part");

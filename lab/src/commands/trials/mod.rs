@@ -15,7 +15,7 @@ use self::setup::Setup;
 use self::watch::{Watch, Watched};
 use super::evaluate::command_line;
 use super::{Outcome, check_page, completions, print_line, print_text, stop_requests, word, write_report};
-use blindgrasp_cli::shard::Shard;
+use blindgrasp_cli::shard::{Shard, all_shards};
 use blindgrasp_graph::dataflow::{self, Override};
 use blindgrasp_graph::launcher::LaunchOptions;
 use blindgrasp_learning::trials::late_decisions::LateDecisions;
@@ -188,10 +188,16 @@ fn merge(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let mut shards = Vec::new();
     for path in &arguments.merge {
         let text = read_regular(path).with_context(|| path.display().to_string())?;
-        let report = serde_json::from_str(&text);
-        shards.push(report.with_context(|| format!("{}: expected the JSON of trials --json", path.display()))?);
+        let report: TrialsReport = serde_json::from_str(&text)
+            .with_context(|| format!("{}: expected the JSON of trials --json", path.display()))?;
+        match report.shard {
+            Some((idx, n)) if report.end == "finished" => shards.push((Shard { idx, n }, report)),
+            Some((idx, n)) => bail!("--merge: shard {idx}/{n} was {} before all was done: make it again", report.end),
+            None => bail!("--merge: {} is of no shard: expected those of trials --shard I/N --json", path.display()),
+        }
     }
-    let report = TrialsReport::merge(shards).map_err(|error| anyhow::anyhow!("--merge: {error}"))?;
+    let shards = all_shards(shards, TrialsReport::is_of_run).map_err(|error| anyhow::anyhow!("--merge: {error}"))?;
+    let report = TrialsReport::merge(shards);
     print_report(arguments, &report)?;
     Ok(Outcome::Done)
 }

@@ -8,7 +8,7 @@ version: 1
 name: grasp_gate
 machines:
   robot: {}
-  brain: {listen: [tls/192.168.1.10:7447, 'tls/[fd00::1]:7447'], ssh: user@brain.local}
+  brain: {listen: [tls/192.168.1.10:7447, 'tls/[fd00::1]:7447']}
   laptop: {}
 link: {keys: ./keys, deadline_ms: 50, buffer: 100}
 operators:
@@ -80,16 +80,15 @@ fn machines_become_part_of_the_graph() {
     fs::create_dir_all(folder.0.join("models")).expect("folder");
     fs::write(folder.0.join("models/a.json"), "").expect("file");
     let graph = check_in(&folder, SPLIT, Scope::Everything, &ALL, &[]).expect("good");
-    let machine = |name: &str, listen: &[&str], ssh: Option<&str>| Machine {
+    let machine = |name: &str, listen: &[&str]| Machine {
         name: name.into(),
         listen: listen.iter().map(ToString::to_string).collect(),
-        ssh: ssh.map(str::to_owned),
     };
     let expected = Machines {
         machines: vec![
-            machine("robot", &[], None),
-            machine("brain", &["tls/192.168.1.10:7447", "tls/[fd00::1]:7447"], Some("user@brain.local")),
-            machine("laptop", &[], None),
+            machine("robot", &[]),
+            machine("brain", &["tls/192.168.1.10:7447", "tls/[fd00::1]:7447"]),
+            machine("laptop", &[]),
         ],
         link: LinkSettings {
             keys: Some(folder.0.join("keys")),
@@ -153,7 +152,7 @@ fn the_form_of_machines() {
         ("machines: {a: {}, b c: {}}\n", "3:19: machine 'b c' must be letters (a-z, A-Z), digits, _ and -, at most 32"),
         ("machines: {a: {}, a: {}}\n", "3:19: duplicate key 'a', first given in line 3"),
         ("machines: {a: {lisen: x}}\n", "3:16: unknown key 'lisen' in machine 'a'; did you mean 'listen'?"),
-        ("machines: {a: {address: x}}\n", "3:16: unknown key 'address' in machine 'a'; known keys: listen, ssh"),
+        ("machines: {a: {address: x}}\n", "3:16: unknown key 'address' in machine 'a'; known keys: listen"),
         (
             "machines: {a: {listen: }}\n",
             "3:16: 'listen' of machine 'a' must be a text or a list of texts, found nothing; write it like \
@@ -193,18 +192,6 @@ fn the_form_of_machines() {
         (
             "machines: {a: {listen: unix/gate}, b: {listen: unix/gate}}\n",
             "3:48: 'listen' of machine 'b': machine 'a' listens at 'unix/gate' already",
-        ),
-        (
-            "machines: {a: {ssh: -oProxyCommand=x}}
-",
-            "3:21: 'ssh' of machine 'a' must be a destination of ssh, found '-oProxyCommand=x'; write it like \
-             user@192.168.1.10, or as a host of ~/.ssh/config",
-        ),
-        (
-            "machines: {a: {ssh: [a]}}
-",
-            "3:21: 'ssh' of machine 'a' must be a destination of ssh, found a list; write it like user@192.168.1.10, or \
-             as a host of ~/.ssh/config",
         ),
     ] {
         check_split_err(&file(machines), expected);
@@ -342,7 +329,7 @@ fn where_nodes_run() {
 
 #[test]
 fn of_two_machines_with_an_edge_one_listens() {
-    let brain = "  brain: {listen: [tls/192.168.1.10:7447, 'tls/[fd00::1]:7447'], ssh: user@brain.local}\n";
+    let brain = "  brain: {listen: [tls/192.168.1.10:7447, 'tls/[fd00::1]:7447']}\n";
     check_instead(
         brain,
         "  brain: {}\n",
