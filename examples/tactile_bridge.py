@@ -58,6 +58,7 @@ def connect_to(address):
 
 def connect(address):
     """Connects, as often as it takes, to an address or a graph; without one, to the only graph of this user that takes frames."""
+    told = None
     while True:
         why = f"no graph {address or ''} takes frames (NAME.hand in {', '.join(SOCKET_FOLDERS)})"
         connections = {}
@@ -70,7 +71,9 @@ def connect(address):
             sys.exit(f"{len(connections)} graphs take frames, at {', '.join(connections)}: name one with --graph NAME")
         for connection in connections.values():
             return connection
-        print(f"{why}; trying again", file=sys.stderr)
+        if why != told:
+            print(f"{why}; trying again", file=sys.stderr)
+        told = why
         time.sleep(1)
 
 

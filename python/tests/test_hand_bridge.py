@@ -341,6 +341,15 @@ class Reconnects(unittest.TestCase):
                         module.connect(None)
             right.close()
 
+    def test_a_table_that_cannot_be_used_is_refused(self):
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder, "table.yaml")
+            for text, says in ((None, "No such file"), ("cells: [", "expected"), ("cells: [{}]", r"cells\[0\]: `topic` is missing")):
+                if text is not None:
+                    path.write_text(text)
+                with self.assertRaisesRegex(ValueError, says):
+                    bridge.read_table(path)
+
     def test_signals_end_a_bridge_that_waits_for_a_source(self):
         work = "import line_protocol; line_protocol.run(lambda: line_protocol.Source('unix:/nowhere'))"
         for number in (signal.SIGINT, signal.SIGTERM):

@@ -35,9 +35,9 @@ pub enum FeatureTableError {
     Io(#[from] std::io::Error),
 }
 
-/// Writes a row (CSV) for each grasp with a label and a contact, of the recordings whose index `is_own`. A row has where the grasp was recorded, its label, the
-/// identities of hand and features, then the features of its first settled frame, each under its name. The limits of the
-/// model's training data are not applied.
+/// Writes a row (CSV) for each grasp with a label and a contact, of the recordings whose index `is_own`. A row has where the
+/// grasp was recorded, its label, the identities of hand and features, then the features of its first settled frame, each
+/// under its name. The limits of the model's training data are not applied.
 ///
 /// # Errors
 /// A recording cannot be used or is given twice, an object is of two classes, or the table cannot be written.

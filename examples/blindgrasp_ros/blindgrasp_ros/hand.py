@@ -117,6 +117,19 @@ def check(where, entry, expected, required=()):
             raise ValueError(f"{where}: {key}: {value!r}, expected {what}: correct it, see --help")
 
 
+def read_table(path):
+    """The table of a file. Raises ValueError if it cannot be used."""
+    import yaml
+
+    try:
+        with open(path, encoding="utf-8") as file:
+            table = yaml.safe_load(file)
+    except (OSError, yaml.YAMLError) as error:
+        raise ValueError(getattr(error, "strerror", None) or error) from None
+    check_table(table)
+    return table
+
+
 def check_table(table):
     """Refuses a table, as `check` does."""
     check("the table", table, TABLE, ["cells"])
@@ -505,12 +518,8 @@ def work():
     options = line_protocol.options(__doc__)
     options.add_argument("table", help="the topics (YAML)")
     given = options.parse_args(arguments())
-    import yaml
-
-    with open(given.table, encoding="utf-8") as file:
-        table = yaml.safe_load(file)
     try:
-        check_table(table)
+        table = read_table(given.table)
         bridge(table, line_protocol.Source(given.address, hand=given.hand))
     except ValueError as error:
         sys.exit(f"{given.table}: {error}")

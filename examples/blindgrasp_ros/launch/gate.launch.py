@@ -1,5 +1,9 @@
 """Starts a graph, the nodes that connect it to the robot, and a gate: ros2 launch blindgrasp_ros gate.launch.py --show-args"""
 
+import os
+import shutil
+
+from blindgrasp_ros.hand import read_table
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, ExecuteProcess, OpaqueFunction, Shutdown
 from launch_ros.actions import Node
@@ -7,7 +11,7 @@ from launch_ros.actions import Node
 ARGUMENTS = {
     "run": ("", "the dataflow file of the graph; without one, the graph is run elsewhere"),
     "graph": ("live_gate", "the name of the graph"),
-    "namespace": ("/blindgrasp", "of the topics of decisions: each hand has one of its own"),
+    "namespace": ("/blindgrasp", "of the topics of decisions: each hand has one of its own, such as /blindgrasp/left"),
     "table": ("", "the topics of the hand (YAML); without one, another bridge sends the frames"),
     "address": ("", "of tactile_source, if it is not its usual socket"),
     "gate": ("none", "lift: an example of an arm that lifts on LIFT alone; gripper: the controller of MoveIt's gripper"),
@@ -20,14 +24,51 @@ ARGUMENTS = {
 }
 
 
+# Launch may be killed, and nothing goes on without it.
+DIES_WITH_LAUNCH = ["setpriv", "--pdeathsig", "TERM"]
+
+
+def check(given):
+    """Refuses arguments with which nodes would fail again and again."""
+    for program in ("blindgrasp", "setpriv"):
+        if shutil.which(program) is None:
+            raise ValueError(f"the program {program} is not in PATH: install it")
+    if given["run"] and not os.path.isfile(given["run"]):
+        raise ValueError(f"run:={given['run']}: there is no such file in {os.getcwd()}")
+    if not given["table"]:
+        return
+    try:
+        joints = read_table(given["table"]).get("joints", {}).get("topic", "/joint_states")
+    except ValueError as error:
+        raise ValueError(f"table:={given['table']}: {error}") from None
+    if joints.lstrip("/") == f"{given['namespace']}/joint_states".lstrip("/"):
+        raise ValueError(f"namespace:={given['namespace']}: the table reads {joints} there, which decisions publishes as well: choose another")
+
+
+def graph_has_ended(event, _):
+    # 3: it has ended as it should, but samples were lost.
+    if event.returncode not in (0, 3):
+        raise RuntimeError("the graph has failed, see its messages above")
+    return Shutdown(reason="the graph has ended")
+
+
 def actions(context):
     given = {name: context.launch_configurations[name] for name in ARGUMENTS}
     given["namespace"] = given["namespace"].rstrip("/") or "/blindgrasp"
+    check(given)
 
     def node(executable, *arguments):
-        arguments = list(arguments)
-        # A node of decisions that starts again says first that none is valid.
-        return Node(package="blindgrasp_ros", executable=executable, arguments=arguments, output="screen", respawn=True, respawn_delay=1.0)
+        return Node(
+            package="blindgrasp_ros",
+            executable=executable,
+            arguments=list(arguments),
+            prefix=" ".join(DIES_WITH_LAUNCH),
+            exec_name=executable,
+            output="screen",
+            # A node of decisions that starts again says first that none is valid.
+            respawn=True,
+            respawn_delay=1.0,
+        )
 
     def option(name):
         return [f"--{name.replace('_', '-')}", given[name]] if given[name] else []
@@ -35,9 +76,9 @@ def actions(context):
     started = [node("decisions", given["graph"], *option("namespace"))]
     topic = f"{given['namespace']}/decision"
     if given["run"]:
-        command = ["blindgrasp", "run", given["run"], "--name", given["graph"]]
+        command = [*DIES_WITH_LAUNCH, "blindgrasp", "run", given["run"], "--name", given["graph"]]
         # Nothing lifts without the graph.
-        started.append(ExecuteProcess(cmd=command, output="screen", on_exit=Shutdown(reason="the graph has ended")))
+        started.append(ExecuteProcess(cmd=command, name="graph", output="screen", on_exit=graph_has_ended))
     if given["table"]:
         started.append(node("hand", given["table"], *(option("address") or option("graph"))))
     if given["gate"] == "lift":
