@@ -1,8 +1,8 @@
 //! `blindgrasp export`
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
-use std::io::{BufRead, BufReader, BufWriter, Write};
+use std::io::{BufRead, BufReader, BufWriter, Read, Write};
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use super::{Outcome, check_new, completions, data_on_stdout, print_line};
-use blindgrasp_cli::shard::{Place, Shard, merge_files};
+use blindgrasp_cli::shard::{Place, Shard, hash, merge_files};
 use blindgrasp_grasps::dataset::{hand_of_all, label_of};
 use blindgrasp_grasps::feature_table::{
     COLUMNS, FeatureTable, FeatureTableError, merge_feature_rows, write_feature_table,
@@ -54,8 +54,8 @@ pub(super) struct Arguments {
     /// place in the whole (JSON), and the header follows.
     #[arg(long, value_name = "I/N", requires = "features")]
     shard: Option<Shard>,
-    /// Make the table of the whole from those of all shards.
-    #[arg(long, value_name = "FILE", num_args = 1.., requires = "out", conflicts_with_all = ["recordings", "topic", "features"])]
+    /// Merge the tables of all shards into that of the whole.
+    #[arg(long, value_name = "FILE", num_args = 1.., requires = "out", conflicts_with_all = ["recordings", "topic", "features", "shard", "hand"])]
     merge: Vec<PathBuf>,
     /// Pad layout of the hand, for --features; default: that of the first recording, if its name is a built-in one.
     #[arg(long, requires = "features", add = completions::hands())]
@@ -107,7 +107,10 @@ fn export_features(arguments: &Arguments, model: &Path, out: &Path) -> anyhow::R
     if arguments.shard.is_some() {
         let mut place = Place::new(shard, (model.hand.id, model.dictionary_id(), hand.description_id()), &recordings);
         place.n_lines = table.readings.iter().map(Vec::len).collect();
-        writeln!(to_file, "{}", serde_json::to_string(&PlacedTable { place, readings: table.readings.concat() })?)?;
+        place.output_id = hash(&rows);
+        let FeatureTable { readings, n_excluded } = &table;
+        let placed = PlacedTable { place, readings: readings.concat(), n_excluded: n_excluded.clone() };
+        writeln!(to_file, "{}", serde_json::to_string(&placed)?)?;
         to_file.write_all(&rows)?;
     }
     to_file.flush().with_context(|| out.display().to_string())?;
@@ -123,24 +126,34 @@ struct PlacedTable {
     place: Place,
     /// The reading of each row: the whole leaves out those that an earlier grasp has.
     readings: Vec<ReadingId>,
+    n_excluded: BTreeMap<String, usize>,
 }
 
 fn merge_features(arguments: &Arguments, out: &Path) -> anyhow::Result<Outcome> {
     let file = NewFile::create(out, &arguments.merge, arguments.overwrite)?;
     const EXPECTED: &str = "expected a whole table of export --features --shard I/N";
-    let mut header = StringRecord::new();
+    let (mut header, mut n_excluded) = (StringRecord::new(), BTreeMap::new());
     let rows = merge_files(&arguments.merge, |path| {
         let mut text = BufReader::new(open_regular(path)?);
-        let mut line = String::new();
+        let (mut line, mut rows) = (String::new(), Vec::new());
         text.read_line(&mut line).context(EXPECTED)?;
-        let PlacedTable { place, readings } = serde_json::from_str(&line).context(EXPECTED)?;
-        let mut table = csv::Reader::from_reader(text);
+        text.read_to_end(&mut rows)?;
+        let of_shard: PlacedTable = serde_json::from_str(&line).context(EXPECTED)?;
+        anyhow::ensure!(of_shard.place.output_id == hash(&rows), EXPECTED);
+        let mut table = csv::Reader::from_reader(rows.as_slice());
         header.clone_from(table.headers().context(EXPECTED)?);
         let rows = table.records().collect::<Result<Vec<_>, _>>().context(EXPECTED)?;
-        anyhow::ensure!(header.iter().take(COLUMNS.len()).eq(COLUMNS) && rows.len() == readings.len(), EXPECTED);
-        Ok((place, readings.into_iter().zip(rows).collect()))
+        anyhow::ensure!(
+            header.iter().take(COLUMNS.len()).eq(COLUMNS) && rows.len() == of_shard.readings.len(),
+            EXPECTED
+        );
+        for (reason, n) in of_shard.n_excluded {
+            *n_excluded.entry(reason).or_default() += n;
+        }
+        Ok((of_shard.place, of_shard.readings.into_iter().zip(rows).collect()))
     })?;
-    let table = merge_feature_rows(&header, rows, BufWriter::new(&file.file)).map_err(|error| of_table(error, out))?;
+    let to = BufWriter::new(&file.file);
+    let table = merge_feature_rows(&header, rows, n_excluded, to).map_err(|error| of_table(error, out))?;
     file.finish()?;
     print_table(out, &table, header.len() - COLUMNS.len())
 }

@@ -8,11 +8,11 @@ use serde_json::json;
 
 use super::{Outcome, completions, print_line};
 use blindgrasp_cli::frame_lines::read_frames;
-use blindgrasp_cli::shard::{Place, Shard, merge_files};
+use blindgrasp_cli::shard::{Place, Shard, hash, merge_files};
 use blindgrasp_grasps::dataset::hand_of;
 use blindgrasp_grasps::decide::{Decided, decide, decide_frames, has_probability};
+use blindgrasp_messages::LiftDecision;
 use blindgrasp_messages::files::read_regular;
-use blindgrasp_messages::{GraspTruth, LiftDecision};
 use blindgrasp_recording::recordings_in;
 use blindgrasp_stages::{ArbiterOptions, Hand, Judge, Model, Probe};
 
@@ -40,10 +40,10 @@ pub(super) struct Arguments {
     /// those after the test lift
     #[arg(long, default_value = "none")]
     probe: ProbeWord,
-    /// Take only every N-th file, from the I-th on (0/N to N-1/N). With --json, a last line has the shard's place in the whole
+    /// Take only every N-th file, from the I-th on (0/N to N-1/N). With --json, the last line has the shard's place in the whole
     #[arg(long, value_name = "I/N")]
     shard: Option<Shard>,
-    /// Decide nothing: print the JSON of the whole, from the files with that of each shard
+    /// Merge the JSON of all shards into that of the whole
     #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with_all = ["model", "files", "hand", "probe", "shard"])]
     merge: Vec<PathBuf>,
     /// Print JSON, one object a grasp
@@ -85,38 +85,30 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         path.display()
     );
     let options = ArbiterOptions { probe, ..ArbiterOptions::default() };
-    let (files, shard) = (recordings_in(&arguments.files)?, arguments.shard.unwrap_or_default());
-    let hand_file = match &arguments.hand {
-        Some(hand) => std::fs::read(hand).ok(),
-        None => None,
-    };
-    let settings = (std::fs::read(path)?, &arguments.hand, hand_file, arguments.probe as u8);
-    let mut place = Place::new(shard, settings, &files);
-    for file in &shard.of(files) {
-        let is_recording = file.extension().is_some_and(|extension| extension == "mcap");
-        if is_recording {
-            let hand = hand_of(file, arguments.hand.as_deref())?;
-            let judge = Judge::with_options(hand, model.clone(), options);
-            let mut judge = judge.with_context(|| format!("recording {}", file.display()))?;
-            let all = decide(&mut judge, file)?;
-            place.n_lines.push(all.len());
-            for decided in all {
-                print(arguments.json, file, &decided, decided.truth.as_ref())?;
+    let files = recordings_in(&arguments.files)?;
+    let mut place = None;
+    if let Some(shard) = arguments.shard {
+        let hand = std::fs::read(arguments.hand.as_deref().unwrap_or(Path::new(""))).ok();
+        place = Some(Place::new(shard, (std::fs::read(path)?, hand, arguments.probe as u8), &files));
+    }
+    for file in &arguments.shard.unwrap_or_default().of(files) {
+        let decided = decide_file(file, &model, options, arguments.hand.as_deref())?;
+        if let Some(place) = &mut place {
+            place.n_lines.push(decided.len());
+        }
+        for decided in decided {
+            if !arguments.json {
+                print(&decided)?;
+                continue;
             }
-        } else {
-            let hand = hand_of_model(&model, arguments.hand.as_deref())?;
-            let read = read_frames(file, &hand)?;
-            let mut judge = Judge::with_options(hand, model.clone(), options)?;
-            let all = decide_frames(&mut judge, &read.frames);
-            place.n_lines.push(all.len());
-            for decided in all {
-                let grasp_id = decided.decision.grasp_id;
-                let known = read.truths.range((grasp_id, 0)..=(grasp_id, u64::MAX)).next();
-                print(arguments.json, file, &decided, known.map(|(_, (_, truth))| truth))?;
+            let line = json_of(file, &decided);
+            print_line(&line)?;
+            if let Some(place) = &mut place {
+                place.output_id = hash((place.output_id, line));
             }
         }
     }
-    if arguments.json && arguments.shard.is_some() {
+    if let (true, Some(place)) = (arguments.json, place) {
         print_line(&serde_json::to_string(&place)?)?;
     }
     Ok(Outcome::Done)
@@ -124,14 +116,41 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
 
 /// Prints the lines of the whole, from those of all shards.
 fn print_merged(paths: &[PathBuf]) -> anyhow::Result<Outcome> {
+    const EXPECTED: &str = "expected the whole output of predict --shard I/N --json";
     let lines = merge_files(paths, |path| {
-        let mut lines: Vec<String> = read_regular(path)?.lines().map(String::from).collect();
-        let place = serde_json::from_str(&lines.pop().unwrap_or_default())
-            .context("expected the whole JSON of predict --shard I/N --json: the last line has no place")?;
+        let text = read_regular(path)?;
+        let mut lines: Vec<String> = text.lines().map(String::from).collect();
+        let place: Place = serde_json::from_str(&lines.pop().unwrap_or_default()).context(EXPECTED)?;
+        let output_id = lines.iter().fold(0, |id, line| hash((id, line)));
+        anyhow::ensure!(place.output_id == output_id, EXPECTED);
         Ok((place, lines))
     })?;
     lines.iter().try_for_each(|line| print_line(line))?;
     Ok(Outcome::Done)
+}
+
+/// The decisions on the grasps of a recording, or of lines of frames.
+fn decide_file(
+    file: &Path,
+    model: &Model,
+    options: ArbiterOptions,
+    hand: Option<&Path>,
+) -> anyhow::Result<Vec<Decided>> {
+    if file.extension().is_some_and(|extension| extension == "mcap") {
+        let judge = Judge::with_options(hand_of(file, hand)?, model.clone(), options);
+        let mut judge = judge.with_context(|| format!("recording {}", file.display()))?;
+        return Ok(decide(&mut judge, file)?);
+    }
+    let hand = hand_of_model(model, hand)?;
+    let read = read_frames(file, &hand)?;
+    let mut decided = decide_frames(&mut Judge::with_options(hand, model.clone(), options)?, &read.frames);
+    for decided in &mut decided {
+        let grasp_id = decided.decision.grasp_id;
+        if let Some((_, (_, truth))) = read.truths.range((grasp_id, 0)..=(grasp_id, u64::MAX)).next() {
+            decided.truth = Some(truth.clone());
+        }
+    }
+    Ok(decided)
 }
 
 fn hand_of_model(model: &Model, path: Option<&Path>) -> anyhow::Result<Hand> {
@@ -145,23 +164,23 @@ fn hand_of_model(model: &Model, path: Option<&Path>) -> anyhow::Result<Hand> {
     Ok(hand)
 }
 
-fn print(json: bool, file: &Path, decided: &Decided, truth: Option<&GraspTruth>) -> std::io::Result<()> {
+fn json_of(file: &Path, decided: &Decided) -> String {
     let LiftDecision { grasp_id, action, reason, probability_stable, .. } = &decided.decision;
-    if json {
-        return print_line(
-            &json!({
-                "file": file.display().to_string(),
-                "grasp_id": grasp_id,
-                "action": action,
-                "reason": reason.as_str(),
-                "probability_stable": probability_stable,
-                "truth": truth,
-                "why": decided.why,
-            })
-            .to_string(),
-        );
-    }
-    let truth = truth.map_or(String::new(), |truth| {
+    let line = json!({
+        "file": file.display().to_string(),
+        "grasp_id": grasp_id,
+        "action": action,
+        "reason": reason.as_str(),
+        "probability_stable": probability_stable,
+        "truth": decided.truth,
+        "why": decided.why,
+    });
+    line.to_string()
+}
+
+fn print(decided: &Decided) -> std::io::Result<()> {
+    let LiftDecision { grasp_id, action, reason, probability_stable, .. } = &decided.decision;
+    let truth = decided.truth.as_ref().map_or(String::new(), |truth| {
         format!("  label: {} ({})", if truth.stable { "stable" } else { "unstable" }, truth.object)
     });
     let probability = if has_probability(*reason) { format!("{probability_stable:.3}") } else { "-".into() };

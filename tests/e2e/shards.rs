@@ -47,6 +47,10 @@ fn merged_shards_are_the_whole() {
     let [a, b, c] = shards.each_ref().map(String::as_str);
     assert!(table("merged", &["export", "--merge", a, b, c]) == whole, "another table than the whole");
     fails(&[&["export", "--merge", a, b], &to[..]].concat(), "1/3 is missing");
+    // A number that is cut off is a number.
+    let of_shard = std::fs::read(a).expect("read");
+    std::fs::write(a, &of_shard[..of_shard.len() - 4]).expect("written");
+    fails(&[&["export", "--merge", a, b, c], &to[..]].concat(), "shard-2: expected a whole table");
     assert!(std::fs::read(&out).expect("kept") == whole, "a refused merge left another table");
 
     let (_, shards) = outputs(&["test", "--json"], |_, arguments| run(arguments, 0).stdout);

@@ -9,8 +9,8 @@ use blindgrasp_operator::text::{did_you_mean, quote};
 use clap::error::{ContextKind, ContextValue, ErrorKind};
 use clap::{Arg, Command};
 
-/// The words of ROS 2, Docker and systemd, each with the command that does it here.
-pub const WORDS: [(&str, &str); 16] = [
+/// The words of ROS 2, each with the command that does it here.
+pub const WORDS: [(&str, &str); 12] = [
     ("launch", "run"),
     ("node", "ps"),
     ("topic echo", "echo NODE/PORT"),
@@ -23,10 +23,6 @@ pub const WORDS: [(&str, &str); 16] = [
     ("bag record", "record --out FILE"),
     ("bag play", "replay RECORDING"),
     ("bag", "info RECORDING"),
-    ("ls", "ps"),
-    ("restart", "swap NODE"),
-    ("status", "ps"),
-    ("version", "--version"),
 ];
 
 /// The error with a hint: the command or the option that is probably meant.

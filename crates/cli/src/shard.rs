@@ -1,10 +1,13 @@
 //! Work that several processes share.
 
+use std::fmt;
 use std::hash::{DefaultHasher, Hash, Hasher};
+use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 use anyhow::Context;
+use blindgrasp_messages::files::open_regular;
 use blindgrasp_messages::hex_id;
 use serde::{Deserialize, Serialize};
 
@@ -47,86 +50,132 @@ impl FromStr for Shard {
     }
 }
 
+impl fmt::Display for Shard {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}/{}", self.idx, self.n)
+    }
+}
+
 /// The place of a shard's output in the whole. The output has it, and [`merge_files`] asks for it.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Place {
     shard: Shard,
-    /// Identifies the whole: the program, its settings and all files.
+    /// Of the program's version and the options.
     #[serde(with = "hex_id")]
-    whole_id: u64,
+    options_id: u64,
+    /// Of the names of all files of the whole, their lengths and their ends.
+    #[serde(with = "hex_id")]
+    files_id: u64,
+    n_files: usize,
     /// The number of lines of each of the shard's files.
     pub n_lines: Vec<usize>,
+    /// The [`hash`] of the output.
+    #[serde(with = "hex_id")]
+    pub output_id: u64,
+}
+
+/// A hash that another process of this build finds as well.
+pub fn hash(content: impl Hash) -> u64 {
+    let mut hasher = DefaultHasher::new();
+    content.hash(&mut hasher);
+    hasher.finish()
+}
+
+/// The last bytes of a file and its length: a recording ends with checksums. Nothing of a pipe.
+fn end_of(path: &Path) -> std::io::Result<(u64, Vec<u8>)> {
+    let mut file = open_regular(path)?;
+    let n_bytes = file.metadata()?.len();
+    file.seek(SeekFrom::Start(n_bytes.saturating_sub(4096)))?;
+    let mut end = Vec::new();
+    file.take(4096).read_to_end(&mut end)?;
+    Ok((n_bytes, end))
 }
 
 impl Place {
-    /// The place of an output without a line so far, of a whole with these settings and files.
-    pub fn new(shard: Shard, settings: impl Hash, files: &[PathBuf]) -> Place {
+    /// The place of an output without a line so far, of a whole with these options and files.
+    pub fn new(shard: Shard, options: impl Hash, files: &[PathBuf]) -> Place {
         let mut hasher = DefaultHasher::new();
-        (env!("CARGO_PKG_VERSION"), settings, files).hash(&mut hasher);
-        Place { shard, whole_id: hasher.finish(), n_lines: Vec::new() }
+        for path in files {
+            (path, end_of(path).ok()).hash(&mut hasher);
+        }
+        let options_id = hash((env!("CARGO_PKG_VERSION"), options));
+        let (files_id, n_files) = (hasher.finish(), files.len());
+        Place { shard, options_id, files_id, n_files, n_lines: Vec::new(), output_id: 0 }
+    }
+
+    /// What differs from the whole of another place.
+    fn difference(&self, other: &Place) -> Option<&'static str> {
+        match other {
+            _ if self.options_id != other.options_id => Some("program, options, model and hand"),
+            _ if (self.files_id, self.n_files) != (other.files_id, other.n_files) => Some("files, of the same paths"),
+            _ => None,
+        }
+    }
+
+    /// Refuses an output with more or fewer lines than there were.
+    fn check(&self, n_lines: usize) -> anyhow::Result<()> {
+        let Shard { idx, n } = self.shard;
+        let n_own = (self.n_files as u64).saturating_sub(idx).div_ceil(n.max(1));
+        let expected = self.n_lines.iter().try_fold(0_usize, |sum, n| sum.checked_add(*n));
+        anyhow::ensure!(
+            idx < n && self.n_lines.len() as u64 == n_own && expected == Some(n_lines),
+            "shard {} is not as it was written: make it again",
+            self.shard
+        );
+        Ok(())
     }
 }
 
 /// The lines of the whole in its order, from the files with the outputs of all shards, of which `read` gives place and lines.
 ///
 /// # Errors
-/// A file cannot be read, or those of [`merge`].
+/// A file cannot be read, or those of [`all_shards`].
 pub fn merge_files<T>(
     paths: &[PathBuf],
     mut read: impl FnMut(&Path) -> anyhow::Result<(Place, Vec<T>)>,
 ) -> anyhow::Result<Vec<T>> {
     let mut shards = Vec::new();
     for path in paths {
-        shards.push(read(path).with_context(|| path.display().to_string())?);
+        let whole = read(path).and_then(|(place, lines)| place.check(lines.len()).map(|()| (place, lines)));
+        let (place, lines) = whole.with_context(|| path.display().to_string())?;
+        shards.push((place.shard, (place, lines)));
     }
     merge(shards).map_err(|error| anyhow::anyhow!("--merge: {error}"))
 }
 
-/// The lines of the whole in its order, from those of all shards.
-///
-/// # Errors
-/// As those of [`all_shards`], or a shard has other lines than its place says.
-fn merge<T>(shards: Vec<(Place, Vec<T>)>) -> Result<Vec<T>, String> {
-    let placed = shards.into_iter().map(|(place, lines)| (place.shard, (place.whole_id, place.n_lines, lines)));
-    let mut shards = Vec::new();
-    for (idx, (_, n_lines, lines)) in
-        all_shards(placed.collect(), |one, other| one.0 == other.0)?.into_iter().enumerate()
-    {
-        let (n, expected) = (lines.len(), n_lines.iter().sum::<usize>());
-        if n != expected {
-            return Err(format!("shard {idx} has {n} of {expected} lines: make it again"));
-        }
-        shards.push((n_lines.into_iter(), lines.into_iter()));
+fn merge<T>(shards: Vec<(Shard, (Place, Vec<T>))>) -> Result<Vec<T>, String> {
+    let (mut inputs, mut whole) = (Vec::new(), Vec::new());
+    for (place, lines) in all_shards(shards, |(one, _), (other, _)| one.difference(other))? {
+        inputs.push((place.n_lines.into_iter(), lines.into_iter()));
     }
-    let mut whole = Vec::new();
     // The shards take turns, a file each. The first one without a file is behind the last file of all.
-    for idx in (0..shards.len()).cycle() {
-        let (n_lines, lines) = &mut shards[idx];
+    for idx in (0..inputs.len()).cycle() {
+        let (n_lines, lines) = &mut inputs[idx];
         let Some(n) = n_lines.next() else { break };
         whole.extend(lines.take(n));
     }
     Ok(whole)
 }
 
-/// The outputs of all shards, in the order of the shards.
+/// The outputs of all shards, in the order of the shards. `difference` names the property by which two are not of one whole.
 ///
 /// # Errors
 /// A shard is missing, there twice, or of another whole.
-pub fn all_shards<T>(mut outputs: Vec<(Shard, T)>, are_of_one: impl Fn(&T, &T) -> bool) -> Result<Vec<T>, String> {
+pub fn all_shards<T>(
+    mut outputs: Vec<(Shard, T)>,
+    difference: impl Fn(&T, &T) -> Option<&'static str>,
+) -> Result<Vec<T>, String> {
     outputs.sort_by_key(|(shard, _)| shard.idx);
     let n = outputs.first().map(|(shard, _)| shard.n).ok_or("expected all shards, found none")?;
-    for (at, (Shard { idx, n: of }, output)) in outputs.iter().enumerate() {
-        let earlier = &outputs[..at];
-        if let Some((known, _)) = earlier.iter().find(|(known, other)| known.n != *of || !are_of_one(other, output)) {
-            return Err(format!(
-                "shard {idx}/{of} is of another run than {}/{}: expected the same program, options and files",
-                known.idx, known.n
-            ));
-        }
-        if let Some((known, _)) = earlier.last()
-            && known.idx == *idx
-        {
-            return Err(format!("shard {idx}/{n} is there twice"));
+    for (at, (shard, output)) in outputs.iter().enumerate() {
+        for (known, other) in &outputs[..at] {
+            let differs = if shard.n == known.n { difference(other, output) } else { Some("number of shards") };
+            if let Some(differs) = differs {
+                return Err(format!("shard {shard} is of another run than {known}: expected the same {differs}"));
+            }
+            if shard == known {
+                return Err(format!("shard {shard} is there twice"));
+            }
         }
     }
     for idx in 0..n {
@@ -160,18 +209,20 @@ mod tests {
     }
 
     /// The lines of files that have 0, 1, 2, … lines, each with the number of its file.
-    fn output(shard: Shard, n_files: usize, settings: &str) -> (Place, Vec<usize>) {
+    fn output(shard: Shard, n_files: usize, options: &str) -> (Shard, (Place, Vec<usize>)) {
         let files: Vec<PathBuf> = (0..n_files).map(|number| number.to_string().into()).collect();
-        let mut place = Place::new(shard, settings, &files);
+        let mut place = Place::new(shard, options, &files);
         place.n_lines = shard.of(Vec::from_iter(0..n_files));
-        let lines = place.n_lines.iter().flat_map(|number| vec![*number; *number]).collect();
-        (place, lines)
+        let lines: Vec<usize> = place.n_lines.iter().flat_map(|number| vec![*number; *number]).collect();
+        place.check(lines.len()).expect("as it was written");
+        place.check(lines.len() + 1).expect_err("a line more");
+        (shard, (place, lines))
     }
 
     #[test]
     fn the_lines_of_all_shards_are_those_of_the_whole() {
         for (n, n_files) in [(1, 0), (1, 4), (3, 2), (3, 6), (3, 7), (3, 8)] {
-            let (_, whole) = output(Shard::default(), n_files, "");
+            let (_, (_, whole)) = output(Shard::default(), n_files, "");
             let shards = (0..n).rev().map(|idx| output(Shard { idx, n }, n_files, "")).collect();
             assert_eq!(merge(shards).expect("whole"), whole, "{n} shards of {n_files} files");
         }
@@ -180,21 +231,36 @@ mod tests {
     #[test]
     fn holes_are_refused() {
         let shard = |idx, n| output(Shard { idx, n }, 7, "");
-        let (place, mut lines) = shard(0, 2);
-        lines.pop();
         for (shards, says) in [
             (vec![], "found none"),
             (vec![shard(1, 2)], "expected 2 shards, found 1: 0/2 is missing"),
             (vec![shard(0, 3), shard(2, 3)], "1/3 is missing"),
             (vec![shard(0, 2)], "1/2 is missing"),
             (vec![shard(1, 2), shard(0, 2), shard(1, 2)], "1/2 is there twice"),
-            (vec![shard(0, 2), shard(1, 3)], "shard 1/3 is of another run than 0/2"),
-            (vec![shard(0, 2), output(Shard { idx: 1, n: 2 }, 7, "other")], "shard 1/2 is of another run"),
-            (vec![shard(0, 2), output(Shard { idx: 1, n: 2 }, 8, "")], "shard 1/2 is of another run"),
-            (vec![(place, lines), shard(1, 2)], "shard 0 has 11 of 12 lines"),
+            (
+                vec![shard(0, 2), shard(1, 3)],
+                "shard 1/3 is of another run than 0/2: expected the same number of shards",
+            ),
+            (vec![shard(0, 2), output(Shard { idx: 1, n: 2 }, 7, "other")], "expected the same program, options"),
+            (vec![shard(0, 2), output(Shard { idx: 1, n: 2 }, 8, "")], "expected the same files"),
         ] {
             let refused = merge(shards).expect_err(says);
             assert!(refused.contains(says), "{refused}");
+        }
+    }
+
+    #[test]
+    fn places_that_cannot_be_are_refused() {
+        let (_, (place, lines)) = output(Shard { idx: 0, n: 2 }, 4, "");
+        let found = |n_lines: Vec<usize>| Place { n_lines, ..place.clone() }.check(lines.len());
+        found(vec![0, 2]).expect("as it was written");
+        for n_lines in [vec![], vec![2], vec![0, 1], vec![usize::MAX, 3], vec![0, 0, 2]] {
+            found(n_lines.clone()).expect_err(&format!("{n_lines:?}"));
+        }
+        let json = serde_json::to_string(&place).expect("JSON");
+        for (shard, wrong) in [("\"n\":2", "\"n\":0"), ("\"idx\":0", "\"idx\":2")] {
+            let place: Place = serde_json::from_str(&json.replace(shard, wrong)).expect("a place");
+            place.check(lines.len()).expect_err(wrong);
         }
     }
 }

@@ -91,10 +91,14 @@ pub fn hand_of_all(recordings: &[PathBuf], hand: Option<&Path>) -> Result<Hand, 
     let found = hand_of(first, hand)?;
     let (None, Some(built_in)) = (hand, Hand::built_in(&found.name)) else { return Ok(found) };
     for path in others {
+        // One of another hand is refused when it is read.
+        let is_of_hand = RecordingReader::open(path)?.info().hand_id == found.id();
         let own = attached_hand(path, &built_in).unwrap_or(built_in.clone());
-        if own.id() == found.id() && own.description_id() != found.description_id() {
-            let first = first.display();
-            let message = format!("its pad layout differs from that of {first}: say with --hand which one counts");
+        if is_of_hand && !own.is_same(&found) {
+            let message = format!(
+                "its layout, or the built-in one, differs from that of {}: say with --hand which one counts",
+                first.display()
+            );
             return Err(DatasetError::Unusable { path: path.clone(), message });
         }
     }

@@ -58,7 +58,7 @@ pub fn write_feature_table(
     for (recording_idx, path) in recordings.iter().enumerate().filter(|(idx, _)| is_own(*idx)) {
         let mut of_rows = Vec::new();
         for Grasp { grasp_id, value, truth } in read_grasps(path, hand, |_, frames| Settled::of(hand, &frames))? {
-            let (settled, truth) = match usable(value, truth, recording_idx, &mut seen) {
+            let (settled, truth) = match usable(value, truth) {
                 Ok(usable) => usable,
                 Err(reason) => {
                     *n_excluded.entry(reason.into()).or_default() += 1;
@@ -66,8 +66,13 @@ pub fn write_feature_table(
                 }
             };
             objects.push((truth.object.clone(), truth.object_class.clone()));
-            if let Err(fault) = model.features.extract(&settled.felt.reading(), &mut values) {
-                *n_excluded.entry(fault.as_str().into()).or_default() += 1;
+            let noted = match model.features.extract(&settled.felt.reading(), &mut values) {
+                // Only a row takes the place of others with its reading.
+                Ok(_) => note_reading(&mut seen, settled.reading_id, recording_idx, truth.stable),
+                Err(fault) => Err(fault.as_str()),
+            };
+            if let Err(reason) = noted {
+                *n_excluded.entry(reason.into()).or_default() += 1;
                 continue;
             }
             let (recording, stable) = (path.display().to_string(), u8::from(truth.stable).to_string());
@@ -90,39 +95,29 @@ pub fn write_feature_table(
 pub fn merge_feature_rows(
     header: &StringRecord,
     rows: Vec<(ReadingId, StringRecord)>,
+    mut n_excluded: BTreeMap<String, usize>,
     to: impl Write,
 ) -> Result<FeatureTable, FeatureTableError> {
     check_classes(rows.iter().map(|(_, row)| (&row[2], &row[3])))?;
     let mut table = csv::Writer::from_writer(to);
     table.write_record(header)?;
-    let (mut merged, mut seen, mut of_rows) = (FeatureTable::default(), SeenReadings::new(), Vec::new());
+    let (mut seen, mut of_rows) = (SeenReadings::new(), Vec::new());
     for (reading, row) in rows {
         match note_reading(&mut seen, reading, 0, &row[4] == "1") {
             Ok(()) => {
                 table.write_record(&row)?;
                 of_rows.push(reading);
             }
-            Err(reason) => *merged.n_excluded.entry(reason.into()).or_default() += 1,
+            Err(reason) => *n_excluded.entry(reason.into()).or_default() += 1,
         }
     }
     table.flush()?;
-    merged.readings.push(of_rows);
-    Ok(merged)
+    Ok(FeatureTable { readings: vec![of_rows], n_excluded })
 }
 
 /// The settled frame and the label of a grasp, or the reason why it is left out.
-fn usable(
-    settled: Option<Settled>,
-    truth: Option<GraspTruth>,
-    recording_idx: usize,
-    seen: &mut SeenReadings,
-) -> Result<(Settled, GraspTruth), &'static str> {
+fn usable(settled: Option<Settled>, truth: Option<GraspTruth>) -> Result<(Settled, GraspTruth), &'static str> {
     let truth = truth.ok_or("no truth")?;
     let settled = settled.ok_or("no settled frame")?;
-    let noted = note_reading(seen, settled.reading_id, recording_idx, truth.stable);
-    if settled.fault != Fault::None {
-        return Err(settled.left_out_as());
-    }
-    noted?;
-    Ok((settled, truth))
+    if settled.fault != Fault::None { Err(settled.left_out_as()) } else { Ok((settled, truth)) }
 }

@@ -21,7 +21,7 @@ use super::{Outcome, check_output, stop_requests};
 use blindgrasp_cli::shard::{Place, Shard};
 use blindgrasp_graph::dataflow::Override;
 use blindgrasp_operator::diagnostics::print_diagnostic;
-use blindgrasp_replay::expectations;
+use blindgrasp_replay::expectations::{self, Expectations};
 
 /// Replay recordings and compare the results with them
 ///
@@ -69,10 +69,10 @@ pub(super) struct Arguments {
     /// Replace the results in the recordings by those of the replay; expectations stay as they are.
     #[arg(long)]
     update: bool,
-    /// Test only every N-th recording, from the I-th on (0/N to N-1/N).
+    /// Test only every N-th recording, from the I-th on (0/N to N-1/N). --json has the shard's place in the whole.
     #[arg(long, value_name = "I/N")]
     shard: Option<Shard>,
-    /// Test nothing: report the tests of the whole, from the files with the JSON of each shard.
+    /// Merge the JSON of all shards into the report of the whole.
     #[arg(long, value_name = "FILE", num_args = 1..,
           conflicts_with_all = ["recordings", "replace", "overrides", "init", "sweep", "faults", "update", "shard", "keep"])]
     merge: Vec<PathBuf>,
@@ -87,17 +87,18 @@ pub(super) struct Arguments {
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     if !arguments.merge.is_empty() {
         check_outputs(arguments, &arguments.merge)?;
-        return report(arguments, &report::merged(&arguments.merge)?, None);
+        let cases = report::merged(&arguments.merge)?;
+        if !arguments.json {
+            cases.iter().try_for_each(report::print_case)?;
+        }
+        return report(arguments, &cases, None);
     }
-    let recordings = match arguments.recordings.as_slice() {
+    let all = match arguments.recordings.as_slice() {
         [] if arguments.init => init::without_expectations(&arguments.dataflow)?,
         [] => with_expectations(&arguments.dataflow)?,
         named => named.to_vec(),
     };
-    let overrides = format!("{:?}", arguments.overrides);
-    let settings = (std::fs::read(&arguments.dataflow).ok(), &arguments.replace, overrides);
-    let mut place = arguments.shard.map(|shard| Place::new(shard, settings, &recordings));
-    let recordings = arguments.shard.unwrap_or_default().of(recordings);
+    let recordings = arguments.shard.unwrap_or_default().of(all.clone());
     check_outputs(arguments, &recordings)?;
     let n_stops = stop_requests()?;
     let runner = Runner {
@@ -116,6 +117,15 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     if arguments.faults {
         return faults::run(&runner, &recordings, arguments.json);
     }
+    let mut place = None;
+    if let Some(shard) = arguments.shard {
+        let graph = runner.graph(&Expectations::default(), &arguments.overrides);
+        let graph_id = graph.ok().map(|graph| graph.content_id(""));
+        let expected: Vec<_> = all.iter().map(|path| std::fs::read(expectations::path_of(path)).ok()).collect();
+        let mut of_all = Place::new(shard, (graph_id, &arguments.replace, expected), &all);
+        of_all.n_lines = vec![1; recordings.len()];
+        place = Some(of_all);
+    }
     let mut cases: Vec<Case> = Vec::new();
     for recording in &recordings {
         // Those before a stop are reported.
@@ -125,9 +135,6 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
             let _ = report::print_case(&case);
         }
         cases.push(case);
-    }
-    if let Some(place) = &mut place {
-        place.n_lines = vec![1; recordings.len()];
     }
     let reported = report(arguments, &cases, place);
     if cases.len() < recordings.len() {

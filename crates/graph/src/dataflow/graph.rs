@@ -4,7 +4,8 @@ use crate::dataflow::pins::Pins;
 use crate::dataflow::program::Program;
 use blindgrasp_operator::wiring::{EdgePolicy, OnLate, Sandbox};
 use std::fmt;
-use std::path::PathBuf;
+use std::hash::{DefaultHasher, Hash, Hasher};
+use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 
@@ -176,6 +177,19 @@ pub struct Edge<'a> {
 }
 
 impl Graph {
+    /// A digest of the params of all nodes but for those named `left_out`, and of the files that they name.
+    pub fn content_id(&self, left_out: &str) -> u64 {
+        let mut hasher = DefaultHasher::new();
+        for node in &self.nodes {
+            for (param, value) in node.params.iter().filter(|(param, _)| *param != left_out) {
+                let file = value.as_str().filter(|path| Path::new(path).is_file());
+                let file = file.and_then(|path| std::fs::read(path).ok());
+                (&node.id, &node.args, param, value.to_string(), file).hash(&mut hasher);
+            }
+        }
+        hasher.finish()
+    }
+
     /// The node of this id.
     pub fn node(&self, id: &str) -> Option<&Node> {
         self.nodes.iter().find(|node| node.id == id)

@@ -634,6 +634,12 @@ impl Hand {
         self.description_id
     }
 
+    /// Whether both are the same in all but the text that they were read from.
+    pub fn is_same(&self, other: &Hand) -> bool {
+        let [own, others] = [self, other].map(|hand| Hand { description_id: 0, files: Arc::default(), ..hand.clone() });
+        self.description_id == other.description_id || format!("{own:?}") == format!("{others:?}")
+    }
+
     fn digest(&self) -> u64 {
         let mut hasher = Sha256::new();
         let mut number = |value: f64| hasher.update(value.to_le_bytes());

@@ -96,12 +96,13 @@ pub(super) struct Arguments {
     /// Write a report with the tables and pictures of some of the trials (HTML).
     #[arg(long, value_name = "FILE")]
     report: Option<PathBuf>,
-    /// Make only every N-th trial, from the I-th on (0/N to N-1/N); --merge makes one report of the JSON of all shards. Trials
-    /// of a graph that learns from its lifts depend on the shards.
+    /// Make only every N-th trial, from the I-th on (0/N to N-1/N). Trials of a graph that learns from its lifts depend on the
+    /// shards.
     #[arg(long, value_name = "I/N")]
     shard: Option<Shard>,
-    /// Make no trials: show the report of all shards, from the files with the JSON of each.
-    #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with_all = ["shard", "record", "report"])]
+    /// Merge the JSON of all shards into that of the whole.
+    #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with_all = ["objects", "trials", "attempts", "seed", "lift_policy",
+          "model", "options", "physics", "dataflow", "name", "overrides", "shard", "record", "report"])]
     merge: Vec<PathBuf>,
     /// Print JSON, with every attempt.
     #[arg(long)]
@@ -172,14 +173,10 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
         write_report(path, &trials_page(&setup.hand, &report, &strips)?)?;
     }
     print_report(arguments, &report)?;
-    let late = report.late.and_then(|late| late.advice());
-    if let Some(advice) = &late {
-        print_diagnostic(&format!("warning: {advice}"));
-    }
+    is_lossy |= is_late(&report);
     match failed {
         Some(error) => Err(error),
-        None if is_lossy || late.is_some() => Ok(Outcome::FinishedWithLoss),
-        None => Ok(Outcome::Done),
+        None => Ok(Outcome::of(is_lossy)),
     }
 }
 
@@ -192,14 +189,26 @@ fn merge(arguments: &Arguments) -> anyhow::Result<Outcome> {
             .with_context(|| format!("{}: expected the JSON of trials --json", path.display()))?;
         match report.shard {
             Some((idx, n)) if report.end == "finished" => shards.push((Shard { idx, n }, report)),
-            Some((idx, n)) => bail!("--merge: shard {idx}/{n} was {} before all was done: make it again", report.end),
+            Some((idx, n)) => {
+                bail!("--merge: shard {idx}/{n} ended before all was done ({}): make it again", report.end)
+            }
             None => bail!("--merge: {} is of no shard: expected those of trials --shard I/N --json", path.display()),
         }
     }
-    let shards = all_shards(shards, TrialsReport::is_of_run).map_err(|error| anyhow::anyhow!("--merge: {error}"))?;
-    let report = TrialsReport::merge(shards);
+    let shards = all_shards(shards, |one: &TrialsReport, other| {
+        const NAMES: &str = "objects, trials, attempts, seed, options, model, params of the graph and lift policy";
+        if one.is_of_run(other) { None } else { Some(NAMES) }
+    });
+    let report = TrialsReport::merge(shards.map_err(|error| anyhow::anyhow!("--merge: {error}"))?);
     print_report(arguments, &report)?;
-    Ok(Outcome::Done)
+    Ok(Outcome::of(is_late(&report)))
+}
+
+/// Whether attempts were not lifted because the host was slow; says what to do.
+fn is_late(report: &TrialsReport) -> bool {
+    let advice = report.late.and_then(|late| late.advice());
+    advice.iter().for_each(|advice| print_diagnostic(&format!("warning: {advice}")));
+    advice.is_some()
 }
 
 fn check_arguments(arguments: &Arguments) -> anyhow::Result<()> {

@@ -1,6 +1,5 @@
 //! The graph of trials: the node that lifts, and the params of the nodes.
 
-use std::hash::{DefaultHasher, Hash as _, Hasher as _};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
@@ -114,16 +113,7 @@ impl Setup {
 
     /// A digest of the params of all nodes, and of the files that they name: equal in all shards of a run.
     pub(super) fn graph_id(&self) -> anyhow::Result<u64> {
-        let graph = self.graph(Way { obeys: true, name: "" })?;
-        let mut hasher = DefaultHasher::new();
-        for node in &graph.nodes {
-            for (param, value) in node.params.iter().filter(|(param, _)| *param != "shard") {
-                let file = value.as_str().filter(|text| Path::new(text).is_file());
-                let content = file.map_or_else(|| Ok(value.to_string().into_bytes()), std::fs::read)?;
-                (&node.id, param, content).hash(&mut hasher);
-            }
-        }
-        Ok(hasher.finish())
+        Ok(self.graph(Way { obeys: true, name: "" })?.content_id("shard"))
     }
 
     /// The checked graph of a way.

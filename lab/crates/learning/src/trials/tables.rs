@@ -54,33 +54,48 @@ pub struct TrialsReport {
     pub records_without_gate: Vec<TrialRecord>,
 }
 
-/// Adds the records of another shard as if its robot had gone on after the one before: each numbers its grasps and its time from 0.
-fn append(records: &mut Vec<TrialRecord>, more: Vec<TrialRecord>) {
-    let n_grasps = records.iter().map(|record| record.grasp_id + 1).max().unwrap_or(0);
-    let secs = records.iter().map(|record| record.end_secs).fold(0.0, f64::max);
-    records.extend(more.into_iter().map(|record| TrialRecord {
-        grasp_id: record.grasp_id + n_grasps,
-        end_secs: record.end_secs + secs,
-        ..record
-    }));
+/// Puts the records of all shards in order, as if one robot had made them: each shard numbers its grasps and its time from 0.
+fn in_order(shards: Vec<Vec<TrialRecord>>) -> Vec<TrialRecord> {
+    let mut records = Vec::new();
+    for shard in shards {
+        let mut before = 0.0;
+        for record in shard {
+            let end_secs = record.end_secs - before;
+            before = record.end_secs;
+            records.push(TrialRecord { end_secs, ..record });
+        }
+    }
+    records.sort_by_key(|record| (record.trial, record.attempt));
+    let mut secs = 0.0;
+    for (grasp_id, record) in (0..).zip(&mut records) {
+        secs += record.end_secs;
+        (record.grasp_id, record.end_secs) = (grasp_id, secs);
+    }
+    records
 }
 
 impl TrialsReport {
     /// The report of a whole run, from the reports of all its shards, in the order of the shards.
     pub fn merge(shards: Vec<TrialsReport>) -> TrialsReport {
-        let whole = shards.into_iter().reduce(|mut known, report| {
+        let (mut whole, mut with_gate, mut without_gate) = (None::<TrialsReport>, Vec::new(), Vec::new());
+        for mut report in shards {
+            with_gate.push(std::mem::take(&mut report.records_with_gate));
+            without_gate.push(std::mem::take(&mut report.records_without_gate));
+            let Some(known) = &mut whole else {
+                whole = Some(report);
+                continue;
+            };
             if let (Some(late), Some(more)) = (&mut known.late, report.late) {
                 late.n_stale += more.n_stale;
                 late.n_undecided += more.n_undecided;
             }
             known.n_left_out += report.n_left_out;
-            append(&mut known.records_with_gate, report.records_with_gate);
-            append(&mut known.records_without_gate, report.records_without_gate);
-            known
-        });
-        let mut whole = TrialsReport { shard: None, ..whole.unwrap_or_default() };
-        whole.records_with_gate.sort_by_key(|record| (record.trial, record.attempt));
-        whole.records_without_gate.sort_by_key(|record| (record.trial, record.attempt));
+        }
+        let mut whole = whole.unwrap_or_default();
+        if let Some((idx, n)) = whole.shard.take() {
+            whole.command = whole.command.replace(&format!(" --shard {idx}/{n}"), "");
+        }
+        (whole.records_with_gate, whole.records_without_gate) = (in_order(with_gate), in_order(without_gate));
         whole.count();
         whole
     }
