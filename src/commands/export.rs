@@ -14,9 +14,7 @@ use serde_json::{Value, json};
 use super::{Outcome, check_new, completions, data_on_stdout, print_line};
 use blindgrasp_cli::shard::{Place, Shard, hash, merge_files};
 use blindgrasp_grasps::dataset::{hand_of_all, label_of};
-use blindgrasp_grasps::feature_table::{
-    COLUMNS, FeatureTable, FeatureTableError, merge_feature_rows, write_feature_table,
-};
+use blindgrasp_grasps::feature_table::{COLUMNS, FeatureTable, merge_feature_rows, write_feature_table};
 use blindgrasp_messages::files::{keep_mode, open_regular, partial_path, private_file};
 use blindgrasp_operator::text::counted;
 use blindgrasp_recording::{Record, RecordingReader, recordings_in};
@@ -85,29 +83,17 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
 fn export_features(arguments: &Arguments, model: &Path, out: &Path) -> anyhow::Result<Outcome> {
     let recordings = recordings_in(&arguments.recordings)?;
     let file = NewFile::create(out, &[&recordings[..], &[model.to_path_buf()]].concat(), arguments.overwrite)?;
-    let (path, model) = (model, Model::load(model)?);
+    let model = Model::load(model)?;
     let hand = hand_of_all(&recordings, arguments.hand.as_deref())?;
-    if hand.id() != model.hand.id {
-        anyhow::bail!(
-            "{} is of the hand '{}' ({:016x}), {} of '{}' ({:016x}): expected the same",
-            path.display(),
-            model.hand.name,
-            model.hand.id,
-            recordings[0].display(),
-            hand.name,
-            hand.id()
-        );
-    }
+    model.check_hand(&hand).with_context(|| recordings[0].display().to_string())?;
     let shard = arguments.shard.unwrap_or_default();
     // The rows of a shard wait for the line before them, which counts them.
     let (mut rows, mut to_file) = (Vec::new(), BufWriter::new(&file.file));
     let to: &mut dyn Write = if arguments.shard.is_some() { &mut rows } else { &mut to_file };
-    let written = write_feature_table(&hand, &model, &recordings, |idx| shard.has(idx), to);
-    let table = written.map_err(|error| of_table(error, out))?;
+    let table = write_feature_table(&hand, &model, &recordings, |idx| shard.has(idx), to)?;
     if arguments.shard.is_some() {
-        let mut place = Place::new(shard, (model.hand.id, model.dictionary_id(), hand.description_id()), &recordings);
-        place.n_lines = table.readings.iter().map(Vec::len).collect();
-        place.output_id = hash(&rows);
+        let place = Place::new(shard, (model.hand.id, model.dictionary_id(), hand.description_id()), &recordings);
+        let place = place.of_output(table.readings.iter().map(Vec::len).collect(), hash(&rows));
         let FeatureTable { readings, n_excluded } = &table;
         let placed = PlacedTable { place, readings: readings.concat(), n_excluded: n_excluded.clone() };
         writeln!(to_file, "{}", serde_json::to_string(&placed)?)?;
@@ -139,7 +125,7 @@ fn merge_features(arguments: &Arguments, out: &Path) -> anyhow::Result<Outcome> 
         text.read_line(&mut line).context(EXPECTED)?;
         text.read_to_end(&mut rows)?;
         let of_shard: PlacedTable = serde_json::from_str(&line).context(EXPECTED)?;
-        anyhow::ensure!(of_shard.place.output_id == hash(&rows), EXPECTED);
+        let content_id = hash(&rows);
         let mut table = csv::Reader::from_reader(rows.as_slice());
         header.clone_from(table.headers().context(EXPECTED)?);
         let rows = table.records().collect::<Result<Vec<_>, _>>().context(EXPECTED)?;
@@ -150,23 +136,15 @@ fn merge_features(arguments: &Arguments, out: &Path) -> anyhow::Result<Outcome> 
         for (reason, n) in of_shard.n_excluded {
             *n_excluded.entry(reason).or_default() += n;
         }
-        Ok((of_shard.place, of_shard.readings.into_iter().zip(rows).collect()))
+        Ok((of_shard.place, content_id, of_shard.readings.into_iter().zip(rows).collect()))
     })?;
-    let to = BufWriter::new(&file.file);
-    let table = merge_feature_rows(&header, rows, n_excluded, to).map_err(|error| of_table(error, out))?;
+    let table = merge_feature_rows(&header, rows, n_excluded, BufWriter::new(&file.file))?;
     file.finish()?;
     print_table(out, &table, header.len() - COLUMNS.len())
 }
 
-fn of_table(error: FeatureTableError, out: &Path) -> anyhow::Error {
-    match error {
-        FeatureTableError::Dataset(of_recordings) => of_recordings.into(),
-        error => anyhow::Error::from(error).context(format!("cannot write {}", out.display())),
-    }
-}
-
 fn print_table(out: &Path, table: &FeatureTable, n_values: usize) -> anyhow::Result<Outcome> {
-    let grasps = counted(table.readings.concat().len(), "grasp");
+    let grasps = counted(table.readings.iter().map(Vec::len).sum::<usize>(), "grasp");
     print_line(&format!("{}: {grasps}, {n_values} values each", out.display()))?;
     for (reason, n) in &table.n_excluded {
         print_line(&format!("left out: {n} with {reason}"))?;

@@ -1,18 +1,20 @@
 //! `blindgrasp predict`
 
+use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
-use clap::{Args, ValueEnum};
+use clap::Args;
 use serde_json::json;
 
 use super::{Outcome, completions, print_line};
 use blindgrasp_cli::frame_lines::read_frames;
 use blindgrasp_cli::shard::{Place, Shard, hash, merge_files};
+use blindgrasp_cli::{check_probe, word};
 use blindgrasp_grasps::dataset::hand_of;
 use blindgrasp_grasps::decide::{Decided, decide, decide_frames, has_probability};
 use blindgrasp_messages::LiftDecision;
-use blindgrasp_messages::files::read_regular;
+use blindgrasp_messages::files::{open_regular, read_regular_bytes};
 use blindgrasp_recording::recordings_in;
 use blindgrasp_stages::{ArbiterOptions, Hand, Judge, Model, Probe};
 
@@ -36,10 +38,10 @@ pub(super) struct Arguments {
     /// Pad layout of the hand [default: the built-in hand of the model]
     #[arg(long, add = completions::hands())]
     hand: Option<PathBuf>,
-    /// The probe whose frames decide, for a model that was trained on lifts: those of the settled hand, of the tight hand, or
-    /// those after the test lift
-    #[arg(long, default_value = "none")]
-    probe: ProbeWord,
+    /// The probe whose frames decide, of a model trained on lifts: none (the settled hand's), squeeze (the tight hand's) or
+    /// test_lift (those after it)
+    #[arg(long, default_value = "none", value_parser = |text: &str| word::<Probe>(text, "none, squeeze or test_lift"))]
+    probe: Probe,
     /// Take only every N-th file, from the I-th on (0/N to N-1/N). With --json, the last line has the shard's place in the whole
     #[arg(long, value_name = "I/N")]
     shard: Option<Shard>,
@@ -51,79 +53,47 @@ pub(super) struct Arguments {
     json: bool,
 }
 
-/// [`Probe`] on the command line.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-#[value(rename_all = "snake_case")]
-enum ProbeWord {
-    None,
-    Squeeze,
-    TestLift,
-}
-
-impl From<ProbeWord> for Probe {
-    fn from(word: ProbeWord) -> Probe {
-        match word {
-            ProbeWord::None => Probe::None,
-            ProbeWord::Squeeze => Probe::Squeeze,
-            ProbeWord::TestLift => Probe::TestLift,
-        }
-    }
-}
-
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let Some(path) = &arguments.model else { return print_merged(&arguments.merge) };
     let model = Model::load(path)?;
-    let probe = Probe::from(arguments.probe);
-    let can_judge = match probe {
-        Probe::None => true,
-        Probe::Squeeze => model.squeezed.is_some(),
-        Probe::TestLift => model.test_lifted.is_some(),
-    };
-    anyhow::ensure!(
-        can_judge,
-        "{} does not judge grasps after this probe: expected a model trained on lifts with its frames, or another --probe",
-        path.display()
-    );
-    let options = ArbiterOptions { probe, ..ArbiterOptions::default() };
+    check_probe(path, &model, arguments.probe)?;
+    let options = ArbiterOptions { probe: arguments.probe, ..ArbiterOptions::default() };
     let files = recordings_in(&arguments.files)?;
     let mut place = None;
-    if let Some(shard) = arguments.shard {
-        let hand = std::fs::read(arguments.hand.as_deref().unwrap_or(Path::new(""))).ok();
-        place = Some(Place::new(shard, (std::fs::read(path)?, hand, arguments.probe as u8), &files));
+    if let (true, Some(shard)) = (arguments.json, arguments.shard) {
+        let hand_id = match &arguments.hand {
+            Some(hand) => Some(Hand::load(hand)?.description_id()),
+            None => None,
+        };
+        place = Some(Place::new(shard, (read_regular_bytes(path)?, hand_id, arguments.probe as u8), &files));
     }
+    let (mut n_lines, mut content_id) = (Vec::new(), 0);
     for file in &arguments.shard.unwrap_or_default().of(files) {
         let decided = decide_file(file, &model, options, arguments.hand.as_deref())?;
-        if let Some(place) = &mut place {
-            place.n_lines.push(decided.len());
-        }
+        n_lines.push(decided.len());
         for decided in decided {
-            if !arguments.json {
+            if arguments.json {
+                let line = json_of(file, &decided);
+                print_line(&line)?;
+                content_id = hash((content_id, line));
+            } else {
                 print(&decided)?;
-                continue;
-            }
-            let line = json_of(file, &decided);
-            print_line(&line)?;
-            if let Some(place) = &mut place {
-                place.output_id = hash((place.output_id, line));
             }
         }
     }
-    if let (true, Some(place)) = (arguments.json, place) {
-        print_line(&serde_json::to_string(&place)?)?;
+    if let Some(place) = place {
+        print_line(&serde_json::to_string(&place.of_output(n_lines, content_id))?)?;
     }
     Ok(Outcome::Done)
 }
 
 /// Prints the lines of the whole, from those of all shards.
 fn print_merged(paths: &[PathBuf]) -> anyhow::Result<Outcome> {
-    const EXPECTED: &str = "expected the whole output of predict --shard I/N --json";
     let lines = merge_files(paths, |path| {
-        let text = read_regular(path)?;
-        let mut lines: Vec<String> = text.lines().map(String::from).collect();
-        let place: Place = serde_json::from_str(&lines.pop().unwrap_or_default()).context(EXPECTED)?;
-        let output_id = lines.iter().fold(0, |id, line| hash((id, line)));
-        anyhow::ensure!(place.output_id == output_id, EXPECTED);
-        Ok((place, lines))
+        let mut lines = BufReader::new(open_regular(path)?).lines().collect::<Result<Vec<_>, _>>()?;
+        let place = serde_json::from_str(&lines.pop().unwrap_or_default())
+            .context("expected the whole output of predict --shard I/N --json")?;
+        Ok((place, lines.iter().fold(0, |content_id, line| hash((content_id, line))), lines))
     })?;
     lines.iter().try_for_each(|line| print_line(line))?;
     Ok(Outcome::Done)

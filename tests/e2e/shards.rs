@@ -4,12 +4,18 @@ use std::path::Path;
 
 use serde_json::Value;
 
-use crate::common::{MODEL, RECORDING, fails, json_of, project, run, text};
+use crate::common::{MODEL, RECORDING, blindgrasp, fails, project, run, text};
 
-/// Runs the command whole and in three shards, and gives the outputs: what `output` finds for the whole and each shard.
-fn outputs(command: &[&str], output: impl Fn(&str, &[&str]) -> Vec<u8>) -> (Vec<u8>, [Vec<u8>; 3]) {
-    let of_shard = |shard| output(shard, &[command, &["--shard", shard]].concat());
-    (output("whole", command), ["0/3", "1/3", "2/3"].map(of_shard))
+/// The output of the command, and those of its three shards.
+fn outputs(command: &[&str], output: impl Fn(&[&str]) -> Vec<u8>) -> (Vec<u8>, [Vec<u8>; 3]) {
+    (output(command), ["0/3", "1/3", "2/3"].map(|shard| output(&[command, &["--shard", shard]].concat())))
+}
+
+/// The outcomes of tests without their times.
+fn outcomes(json: &[u8]) -> Value {
+    let mut found: Value = serde_json::from_slice(json).expect("JSON");
+    found["recordings"].as_array_mut().expect("recordings").iter_mut().for_each(|case| case["secs"] = Value::Null);
+    found
 }
 
 /// Writes the shards' outputs to files, and gives their paths in another order.
@@ -30,7 +36,7 @@ fn merged_shards_are_the_whole() {
     let files = [RECORDING, "recordings/ordinary.mcap", copy.to_str().expect("UTF-8"), "recordings/dead-pad.mcap"];
 
     let predict = [&["predict", MODEL, "--json"], &files[..]].concat();
-    let (whole, shards) = outputs(&predict, |_, arguments| run(arguments, 0).stdout);
+    let (whole, shards) = outputs(&predict, |arguments| run(arguments, 0).stdout);
     let shards = written(folder.path(), shards);
     let [a, b, c] = shards.each_ref().map(String::as_str);
     assert!(run(&["predict", "--merge", a, b, c], 0).stdout == whole, "other lines than the whole");
@@ -38,29 +44,30 @@ fn merged_shards_are_the_whole() {
 
     let out = folder.path().join("table.csv");
     let to = ["--out", out.to_str().expect("UTF-8"), "--overwrite"];
-    let table = |_: &str, arguments: &[&str]| {
+    let table = |arguments: &[&str]| {
         run(&[arguments, &to].concat(), 0);
         std::fs::read(&out).expect("written")
     };
     let (whole, shards) = outputs(&[&["export", "--features", MODEL], &files[..]].concat(), table);
     let shards = written(folder.path(), shards);
     let [a, b, c] = shards.each_ref().map(String::as_str);
-    assert!(table("merged", &["export", "--merge", a, b, c]) == whole, "another table than the whole");
+    assert!(table(&["export", "--merge", a, b, c]) == whole, "another table than the whole");
     fails(&[&["export", "--merge", a, b], &to[..]].concat(), "1/3 is missing");
-    // A number that is cut off is a number.
+    // A table that is cut off inside a number is still CSV.
     let of_shard = std::fs::read(a).expect("read");
     std::fs::write(a, &of_shard[..of_shard.len() - 4]).expect("written");
-    fails(&[&["export", "--merge", a, b, c], &to[..]].concat(), "shard-2: expected a whole table");
+    fails(&[&["export", "--merge", a, b, c], &to[..]].concat(), "shard-2: it is not as it was written");
     assert!(std::fs::read(&out).expect("kept") == whole, "a refused merge left another table");
 
-    let (_, shards) = outputs(&["test", "--json"], |_, arguments| run(arguments, 0).stdout);
-    let [a, b, c] = written(folder.path(), shards);
-    let merged = json_of(&["test", "--json", "--merge", &a, &b, &c]);
-    assert_eq!(merged["recordings"].as_array().map(Vec::len), Some(10), "{merged}");
-    // A failure in a shard is one of the whole.
-    let mut failed: Value = serde_json::from_slice(&std::fs::read(&a).expect("read")).expect("JSON");
-    failed["recordings"][0]["checks"][0]["has_passed"] = false.into();
-    std::fs::write(&a, failed.to_string()).expect("written");
-    let output = run(&["test", "--merge", &a, &b, &c], 1);
-    assert!(text(&output.stdout).ends_with("10 recordings: 9 passed, 1 failed\n"), "{}", text(&output.stdout));
+    // One of the recordings fails.
+    std::fs::write(copy.with_extension("expect.yaml"), "accuracy_at_least: 1.0\n").expect("written");
+    let test = [&["test", "--json", "--dataflow", "dataflow.yaml"], &files[1..]].concat();
+    let (whole, shards) = outputs(&test, |arguments| blindgrasp().args(arguments).output().expect("started").stdout);
+    let shards = written(folder.path(), shards);
+    let [a, b, c] = shards.each_ref().map(String::as_str);
+    let merged = run(&["test", "--json", "--merge", a, b, c], 1).stdout;
+    assert_eq!(outcomes(&merged), outcomes(&whole));
+    assert_eq!(outcomes(&merged)["n_failed"], 1);
+    let said = text(&run(&["test", "--merge", a, b, c], 1).stdout);
+    assert!(said.contains("FAIL") && said.ends_with("3 recordings: 2 passed, 1 failed\n"), "{said}");
 }

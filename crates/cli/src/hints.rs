@@ -10,15 +10,13 @@ use clap::error::{ContextKind, ContextValue, ErrorKind};
 use clap::{Arg, Command};
 
 /// The words of ROS 2, each with the command that does it here.
-pub const WORDS: [(&str, &str); 12] = [
+pub const WORDS: [(&str, &str); 10] = [
     ("launch", "run"),
     ("node", "ps"),
     ("topic echo", "echo NODE/PORT"),
     ("topic hz", "top"),
     ("topic pub", "replay RECORDING"),
     ("topic", "ps"),
-    ("param get", "set NODE.PARAM"),
-    ("param set", "set NODE.PARAM=VALUE"),
     ("param", "set"),
     ("bag record", "record --out FILE"),
     ("bag play", "replay RECORDING"),

@@ -29,6 +29,7 @@ use anyhow::Context;
 use blindgrasp_graph::dataflow::DataflowError;
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::text::{HarmlessWriter, harmless};
+use blindgrasp_stages::{Model, Probe};
 use clap::{Command, FromArgMatches};
 
 /// A program's command line and its `main`: the subcommands, each a module with `Arguments` and `run`, of which those behind
@@ -76,6 +77,30 @@ macro_rules! program {
             })
         }
     };
+}
+
+/// The value that a word of an argument stands for.
+pub fn word<T: serde::de::DeserializeOwned>(text: &str, expected: &str) -> Result<T, String> {
+    serde_json::from_value(text.into()).map_err(|_| format!("expected {expected}"))
+}
+
+/// Refuses a probe after which the model judges nothing: every grasp would be held.
+///
+/// # Errors
+/// It names the model, and the grasps that it does not judge.
+pub fn check_probe(path: &Path, model: &Model, probe: Probe) -> anyhow::Result<()> {
+    let (judges, name) = match probe {
+        Probe::None => (true, ""),
+        Probe::Squeeze => (model.squeezed.is_some(), "squeezed"),
+        Probe::TestLift => (model.squeezed.is_some() && model.test_lifted.is_some(), "test_lifted"),
+    };
+    if !judges {
+        anyhow::bail!(
+            "--probe: {} judges no {name} grasps: leave --probe out, or give a model that was trained on lifts with that probe",
+            path.display()
+        );
+    }
+    Ok(())
 }
 
 /// How a command ended that did not fail.

@@ -6,7 +6,7 @@ use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
-use anyhow::Context;
+use anyhow::{Context, bail, ensure};
 use blindgrasp_messages::files::open_regular;
 use blindgrasp_messages::hex_id;
 use serde::{Deserialize, Serialize};
@@ -66,12 +66,11 @@ pub struct Place {
     /// Of the names of all files of the whole, their lengths and their ends.
     #[serde(with = "hex_id")]
     files_id: u64,
-    n_files: usize,
     /// The number of lines of each of the shard's files.
-    pub n_lines: Vec<usize>,
-    /// The [`hash`] of the output.
+    n_lines: Vec<usize>,
+    /// Of all these and the lines.
     #[serde(with = "hex_id")]
-    pub output_id: u64,
+    output_id: u64,
 }
 
 /// A hash that another process of this build finds as well.
@@ -81,13 +80,14 @@ pub fn hash(content: impl Hash) -> u64 {
     hasher.finish()
 }
 
-/// The last bytes of a file and its length: a recording ends with checksums. Nothing of a pipe.
+/// The length of a file and its last bytes. In those of a recording, its index and the checksum of its samples lie.
 fn end_of(path: &Path) -> std::io::Result<(u64, Vec<u8>)> {
+    const MOST_BYTES: u64 = 256 << 10;
     let mut file = open_regular(path)?;
     let n_bytes = file.metadata()?.len();
-    file.seek(SeekFrom::Start(n_bytes.saturating_sub(4096)))?;
+    file.seek(SeekFrom::Start(n_bytes.saturating_sub(MOST_BYTES)))?;
     let mut end = Vec::new();
-    file.take(4096).read_to_end(&mut end)?;
+    file.take(MOST_BYTES).read_to_end(&mut end)?;
     Ok((n_bytes, end))
 }
 
@@ -99,51 +99,49 @@ impl Place {
             (path, end_of(path).ok()).hash(&mut hasher);
         }
         let options_id = hash((env!("CARGO_PKG_VERSION"), options));
-        let (files_id, n_files) = (hasher.finish(), files.len());
-        Place { shard, options_id, files_id, n_files, n_lines: Vec::new(), output_id: 0 }
+        Place { shard, options_id, files_id: hasher.finish(), n_lines: Vec::new(), output_id: 0 }
+    }
+
+    /// The place of an output with so many lines of each file, whose content has this [`hash`].
+    pub fn of_output(mut self, n_lines: Vec<usize>, content_id: u64) -> Place {
+        self.n_lines = n_lines;
+        self.output_id = self.id_with(content_id);
+        self
+    }
+
+    fn id_with(&self, content_id: u64) -> u64 {
+        hash((self.shard.to_string(), self.options_id, self.files_id, &self.n_lines, content_id))
     }
 
     /// What differs from the whole of another place.
     fn difference(&self, other: &Place) -> Option<&'static str> {
-        match other {
-            _ if self.options_id != other.options_id => Some("program, options, model and hand"),
-            _ if (self.files_id, self.n_files) != (other.files_id, other.n_files) => Some("files, of the same paths"),
-            _ => None,
+        if self.options_id != other.options_id {
+            return Some("program, options, model and hand");
         }
-    }
-
-    /// Refuses an output with more or fewer lines than there were.
-    fn check(&self, n_lines: usize) -> anyhow::Result<()> {
-        let Shard { idx, n } = self.shard;
-        let n_own = (self.n_files as u64).saturating_sub(idx).div_ceil(n.max(1));
-        let expected = self.n_lines.iter().try_fold(0_usize, |sum, n| sum.checked_add(*n));
-        anyhow::ensure!(
-            idx < n && self.n_lines.len() as u64 == n_own && expected == Some(n_lines),
-            "shard {} is not as it was written: make it again",
-            self.shard
-        );
-        Ok(())
+        if self.files_id == other.files_id { None } else { Some("files under the same paths") }
     }
 }
 
-/// The lines of the whole in its order, from the files with the outputs of all shards, of which `read` gives place and lines.
+/// The lines of the whole in its order, from the files with the outputs of all shards. `read` gives the place, the content's
+/// [`hash`] and the lines of a file.
 ///
 /// # Errors
-/// A file cannot be read, or those of [`all_shards`].
+/// A file cannot be read or is not as it was written, or those of [`all_shards`].
 pub fn merge_files<T>(
     paths: &[PathBuf],
-    mut read: impl FnMut(&Path) -> anyhow::Result<(Place, Vec<T>)>,
+    mut read: impl FnMut(&Path) -> anyhow::Result<(Place, u64, Vec<T>)>,
 ) -> anyhow::Result<Vec<T>> {
     let mut shards = Vec::new();
     for path in paths {
-        let whole = read(path).and_then(|(place, lines)| place.check(lines.len()).map(|()| (place, lines)));
-        let (place, lines) = whole.with_context(|| path.display().to_string())?;
-        shards.push((place.shard, (place, lines)));
+        let (place, content_id, lines) = read(path).with_context(|| path.display().to_string())?;
+        let Place { shard, output_id, .. } = place;
+        ensure!(
+            output_id == place.id_with(content_id),
+            "{}: it is not as it was written: make shard {shard} again",
+            path.display()
+        );
+        shards.push((shard, (place, lines)));
     }
-    merge(shards).map_err(|error| anyhow::anyhow!("--merge: {error}"))
-}
-
-fn merge<T>(shards: Vec<(Shard, (Place, Vec<T>))>) -> Result<Vec<T>, String> {
     let (mut inputs, mut whole) = (Vec::new(), Vec::new());
     for (place, lines) in all_shards(shards, |(one, _), (other, _)| one.difference(other))? {
         inputs.push((place.n_lines.into_iter(), lines.into_iter()));
@@ -164,26 +162,25 @@ fn merge<T>(shards: Vec<(Shard, (Place, Vec<T>))>) -> Result<Vec<T>, String> {
 pub fn all_shards<T>(
     mut outputs: Vec<(Shard, T)>,
     difference: impl Fn(&T, &T) -> Option<&'static str>,
-) -> Result<Vec<T>, String> {
+) -> anyhow::Result<Vec<T>> {
     outputs.sort_by_key(|(shard, _)| shard.idx);
-    let n = outputs.first().map(|(shard, _)| shard.n).ok_or("expected all shards, found none")?;
+    let n = outputs.first().context("--merge: expected all shards, found none")?.0.n;
     for (at, (shard, output)) in outputs.iter().enumerate() {
         for (known, other) in &outputs[..at] {
             let differs = if shard.n == known.n { difference(other, output) } else { Some("number of shards") };
             if let Some(differs) = differs {
-                return Err(format!("shard {shard} is of another run than {known}: expected the same {differs}"));
+                bail!("--merge: shard {shard} is of another run than {known}: expected the same {differs}");
             }
-            if shard == known {
-                return Err(format!("shard {shard} is there twice"));
-            }
+            ensure!(shard != known, "--merge: shard {shard} is there twice");
         }
     }
     for idx in 0..n {
         match outputs.get(idx as usize) {
             Some((shard, _)) if shard.idx == idx => {}
-            _ => return Err(format!("expected {n} shards, found {}: {idx}/{n} is missing", outputs.len())),
+            _ => bail!("--merge: expected {n} shards, found {}: {idx}/{n} is missing", outputs.len()),
         }
     }
+    ensure!(outputs.len() as u64 == n, "--merge: expected {n} shards, found {}", outputs.len());
     Ok(outputs.into_iter().map(|(_, output)| output).collect())
 }
 
@@ -209,23 +206,40 @@ mod tests {
     }
 
     /// The lines of files that have 0, 1, 2, … lines, each with the number of its file.
-    fn output(shard: Shard, n_files: usize, options: &str) -> (Shard, (Place, Vec<usize>)) {
+    fn output(shard: Shard, n_files: usize, options: &str) -> (Place, Vec<usize>) {
         let files: Vec<PathBuf> = (0..n_files).map(|number| number.to_string().into()).collect();
-        let mut place = Place::new(shard, options, &files);
-        place.n_lines = shard.of(Vec::from_iter(0..n_files));
-        let lines: Vec<usize> = place.n_lines.iter().flat_map(|number| vec![*number; *number]).collect();
-        place.check(lines.len()).expect("as it was written");
-        place.check(lines.len() + 1).expect_err("a line more");
-        (shard, (place, lines))
+        let n_lines = shard.of(Vec::from_iter(0..n_files));
+        let lines = n_lines.iter().flat_map(|number| vec![*number; *number]).collect();
+        (Place::new(shard, options, &files).of_output(n_lines, 0), lines)
+    }
+
+    fn merged(outputs: &[(Place, Vec<usize>)]) -> anyhow::Result<Vec<usize>> {
+        let (mut next, paths) = (outputs.iter(), vec![PathBuf::new(); outputs.len()]);
+        merge_files(&paths, |_| {
+            let (place, lines) = next.next().context("no output")?;
+            Ok((place.clone(), 0, lines.clone()))
+        })
     }
 
     #[test]
     fn the_lines_of_all_shards_are_those_of_the_whole() {
         for (n, n_files) in [(1, 0), (1, 4), (3, 2), (3, 6), (3, 7), (3, 8)] {
-            let (_, (_, whole)) = output(Shard::default(), n_files, "");
-            let shards = (0..n).rev().map(|idx| output(Shard { idx, n }, n_files, "")).collect();
-            assert_eq!(merge(shards).expect("whole"), whole, "{n} shards of {n_files} files");
+            let (_, whole) = output(Shard::default(), n_files, "");
+            let shards: Vec<_> = (0..n).rev().map(|idx| output(Shard { idx, n }, n_files, "")).collect();
+            assert_eq!(merged(&shards).expect("whole"), whole, "{n} shards of {n_files} files");
         }
+    }
+
+    #[test]
+    fn other_data_under_the_same_name_is_another_whole() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("a.mcap");
+        let place = |content: &str| {
+            std::fs::write(&path, content).expect("written");
+            Place::new(Shard::default(), (), std::slice::from_ref(&path))
+        };
+        assert!(place("one").difference(&place("one")).is_none());
+        assert!(place("one").difference(&place("two")).is_some());
     }
 
     #[test]
@@ -243,24 +257,24 @@ mod tests {
             ),
             (vec![shard(0, 2), output(Shard { idx: 1, n: 2 }, 7, "other")], "expected the same program, options"),
             (vec![shard(0, 2), output(Shard { idx: 1, n: 2 }, 8, "")], "expected the same files"),
+            (vec![shard(0, 2), shard(1, 2), shard(5, 2)], "expected 2 shards, found 3"),
         ] {
-            let refused = merge(shards).expect_err(says);
+            let refused = merged(&shards).expect_err(says).to_string();
             assert!(refused.contains(says), "{refused}");
         }
     }
 
     #[test]
-    fn places_that_cannot_be_are_refused() {
-        let (_, (place, lines)) = output(Shard { idx: 0, n: 2 }, 4, "");
-        let found = |n_lines: Vec<usize>| Place { n_lines, ..place.clone() }.check(lines.len());
-        found(vec![0, 2]).expect("as it was written");
-        for n_lines in [vec![], vec![2], vec![0, 1], vec![usize::MAX, 3], vec![0, 0, 2]] {
-            found(n_lines.clone()).expect_err(&format!("{n_lines:?}"));
+    fn an_output_that_was_changed_is_refused() {
+        let (place, lines) = output(Shard::default(), 4, "");
+        let read = |place: &Place, content_id| {
+            merge_files(&[PathBuf::new()], |_| Ok((place.clone(), content_id, lines.clone())))
+        };
+        assert_eq!(read(&place, 0).expect("as it was written"), lines);
+        read(&place, 1).expect_err("another content");
+        for n_lines in [vec![], vec![0, 1, 2, 4], vec![usize::MAX, 3]] {
+            read(&Place { n_lines, ..place.clone() }, 0).expect_err("other numbers of lines");
         }
-        let json = serde_json::to_string(&place).expect("JSON");
-        for (shard, wrong) in [("\"n\":2", "\"n\":0"), ("\"idx\":0", "\"idx\":2")] {
-            let place: Place = serde_json::from_str(&json.replace(shard, wrong)).expect("a place");
-            place.check(lines.len()).expect_err(wrong);
-        }
+        read(&Place { shard: Shard { idx: 0, n: 0 }, ..place.clone() }, 0).expect_err("another shard");
     }
 }

@@ -35,7 +35,7 @@ pub enum DatasetError {
     Hand(#[from] HandError),
     #[error(transparent)]
     OtherHand(#[from] OtherHand),
-    #[error("expected a recording")]
+    #[error("no recording is named: expected at least one")]
     NoRecording,
     #[error("recording {}: {message}", path.display())]
     Unusable { path: PathBuf, message: String },
@@ -92,9 +92,10 @@ pub fn hand_of_all(recordings: &[PathBuf], hand: Option<&Path>) -> Result<Hand, 
     let (None, Some(built_in)) = (hand, Hand::built_in(&found.name)) else { return Ok(found) };
     for path in others {
         // One of another hand is refused when it is read.
-        let is_of_hand = RecordingReader::open(path)?.info().hand_id == found.id();
-        let own = attached_hand(path, &built_in).unwrap_or(built_in.clone());
-        if is_of_hand && !own.is_same(&found) {
+        if RecordingReader::open(path)?.info().hand_id != found.id() {
+            continue;
+        }
+        if !attached_hand(path, &built_in).as_ref().unwrap_or(&built_in).is_same(&found) {
             let message = format!(
                 "its layout, or the built-in one, differs from that of {}: say with --hand which one counts",
                 first.display()

@@ -17,8 +17,8 @@ use blindgrasp_stages::training_summary::ReadingId;
 pub const COLUMNS: [&str; 7] =
     ["recording", "grasp_id", "object", "object_class", "stable", "hand_id", "dictionary_id"];
 
-/// The readings of a table's rows, by recording, and how many grasps were left out, by reason.
-#[derive(Debug, Clone, Default, PartialEq, Eq)]
+/// The readings of a table's rows, by recording unless it was merged, and how many grasps were left out, by reason.
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub struct FeatureTable {
     pub readings: Vec<Vec<ReadingId>>,
     pub n_excluded: BTreeMap<String, usize>,
@@ -29,9 +29,9 @@ pub struct FeatureTable {
 pub enum FeatureTableError {
     #[error(transparent)]
     Dataset(#[from] DatasetError),
-    #[error(transparent)]
+    #[error("cannot write the table: {0}")]
     Csv(#[from] csv::Error),
-    #[error(transparent)]
+    #[error("cannot write the table: {0}")]
     Io(#[from] std::io::Error),
 }
 
@@ -53,7 +53,7 @@ pub fn write_feature_table(
     let identity = [format!("{:016x}", model.hand.id), format!("{:016x}", model.dictionary_id())];
     let mut table = csv::Writer::from_writer(to);
     table.write_record(COLUMNS.map(String::from).into_iter().chain(model.features.value_names(hand)))?;
-    let FeatureTable { mut readings, mut n_excluded } = FeatureTable::default();
+    let (mut readings, mut n_excluded) = (Vec::new(), BTreeMap::new());
     let (mut values, mut objects, mut seen) = (Vec::new(), Vec::new(), SeenReadings::new());
     for (recording_idx, path) in recordings.iter().enumerate().filter(|(idx, _)| is_own(*idx)) {
         let mut of_rows = Vec::new();

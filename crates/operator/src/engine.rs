@@ -124,9 +124,12 @@ pub(crate) trait Site {
     /// Drops the saved state, because the active instance saves none.
     fn forget_state(&mut self);
 
-    /// Whether the launcher has a command or asks for the end, or ports and worker are to be looked at, also of a stage that is
-    /// always behind.
+    /// Whether the launcher has a command, or asks for the end.
     fn is_interrupted(&self) -> bool;
+    /// Whether ports and worker are to be looked at before further samples. A stage that is always behind is never idle.
+    fn is_look_due(&self) -> bool {
+        false
+    }
     fn should_stop(&self) -> bool;
     fn beat(&self);
     /// Names the sample that is worked on, for the launcher if the process dies of it.
@@ -392,13 +395,14 @@ impl<T: Sample, W: Worker<T>> Engine<T, W> {
     fn answer_samples<S: Site<Sample = T>>(&mut self, site: &mut S, stop: bool) -> anyhow::Result<Sent> {
         // Also while no main sample comes: their writers wait for this reader.
         site.take_in_partners(stop)?;
-        let mut has_heard = false;
+        let (mut has_heard, mut has_moved) = (false, false);
         loop {
-            if self.is_between_samples() && site.is_interrupted() {
+            // Each turn answers a sample, however long a look takes.
+            if self.is_between_samples() && (site.is_interrupted() || has_moved && site.is_look_due()) {
                 return Ok(Sent::Yes);
             }
             match self.advance(site, stop)? {
-                Progress::Moved => {}
+                Progress::Moved => has_moved = true,
                 Progress::GaveWay => return Ok(Sent::GaveWay),
                 Progress::Waits => return Ok(Sent::Yes),
                 Progress::Idle => {
@@ -912,6 +916,9 @@ impl<T: Sample, W: Worker<T>> Engine<T, W> {
                     return Ok(());
                 }
                 self.answer_beside(site, input, taken)?;
+                if site.is_look_due() {
+                    return Ok(());
+                }
             }
         }
         Ok(())

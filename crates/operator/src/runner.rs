@@ -36,7 +36,7 @@ pub(crate) struct Ports {
     pub(crate) inputs: Vec<InputPort>,
     pub(crate) outputs: Vec<OutputPort>,
     partners: Partners,
-    /// When writers, readers and the worker were looked at.
+    /// When writers, readers and the worker were last looked at.
     last_look: Instant,
 }
 
@@ -253,7 +253,11 @@ impl Site for Ports {
     }
 
     fn is_interrupted(&self) -> bool {
-        self.operator.has_command() || self.operator.should_quit() || self.last_look.elapsed() >= TICK
+        self.operator.has_command() || self.operator.should_quit()
+    }
+
+    fn is_look_due(&self) -> bool {
+        self.last_look.elapsed() >= TICK
     }
 
     fn should_stop(&self) -> bool {
@@ -381,8 +385,8 @@ impl<W: Worker<UntypedSample>> Runner<W> {
         }
         // Sending and receiving look as well; between samples there is no hurry, and a reader that was woken may need the
         // core.
-        let is_interrupted = self.site.is_interrupted();
-        if self.site.last_look.elapsed() >= TICK {
+        let has_looked = self.site.is_look_due();
+        if has_looked {
             self.site.last_look = Instant::now();
             self.site.operator.look_at_descriptors()?;
             self.site.look_for_readers()?;
@@ -391,7 +395,9 @@ impl<W: Worker<UntypedSample>> Runner<W> {
             self.site.partners.report(&self.site.operator);
         }
         Ok(match sent {
-            _ if is_interrupted || self.site.is_interrupted() => Turn::Interrupted,
+            _ if self.site.is_interrupted() => Turn::Interrupted,
+            // Samples may be left.
+            _ if has_looked => Turn::Idle(Some(Instant::now())),
             // For the sake of another operator of its group. Nobody says when its reader has room.
             Sent::GaveWay => Turn::Idle(Some(Instant::now() + ROOM_PAUSE)),
             Sent::Yes => Turn::Idle(self.deadline()),

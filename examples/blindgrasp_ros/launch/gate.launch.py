@@ -24,7 +24,7 @@ ARGUMENTS = {
 }
 
 
-# Launch may be killed, and nothing goes on without it.
+# The kernel ends what launch has started if launch is killed.
 DIES_WITH_LAUNCH = ["setpriv", "--pdeathsig", "TERM"]
 
 

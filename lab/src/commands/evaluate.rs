@@ -125,7 +125,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     // Check files before the long work.
     let model = model.map(|path| Ok::<_, anyhow::Error>((path, Model::load(path)?))).transpose()?;
     if let Some((path, model)) = &model {
-        check_probe(path, model, arguments.probe)?;
+        blindgrasp_cli::check_probe(path, model, arguments.probe)?;
     }
     let recordings = recordings_in(recordings)?;
     let inputs = [recordings.as_slice(), &arguments.inputs, arguments.predictions.as_slice()].concat();
@@ -154,22 +154,6 @@ impl Arguments {
     fn is_for_a_model(&self) -> bool {
         self.probe != Probe::None || self.drop_costs.is_some()
     }
-}
-
-/// Refuses a probe after which the model judges nothing: every grasp would be held.
-fn check_probe(path: &Path, model: &Model, probe: Probe) -> anyhow::Result<()> {
-    let (judges, name) = match probe {
-        Probe::None => (true, ""),
-        Probe::Squeeze => (model.squeezed.is_some(), "squeezed"),
-        Probe::TestLift => (model.squeezed.is_some() && model.test_lifted.is_some(), "test_lifted"),
-    };
-    if !judges {
-        bail!(
-            "--probe: {} judges no {name} grasps: leave --probe out, or give a model that was trained on lifts with that probe",
-            path.display()
-        );
-    }
-    Ok(())
 }
 
 /// The inputs that models and recipes have in common.

@@ -15,7 +15,7 @@ mod simulate;
 mod train;
 mod trials;
 
-use blindgrasp_cli::{Outcome, number_in, print_line, print_text, stop_requests};
+use blindgrasp_cli::{Outcome, number_in, print_line, print_text, stop_requests, word};
 use blindgrasp_session::output::{check_new, check_output, check_page, write_out, write_report};
 use blindgrasp_session::text_table::percent;
 
@@ -23,11 +23,6 @@ blindgrasp_cli::program! {
     Learn learn, Simulate simulate, Import import, Train train, Evaluate evaluate, Trials trials, Model model, Sensors sensors, New new;
     hidden Mesh mesh;
     operators crate::operators::SHIPPED; others &[]
-}
-
-/// The value that a word of an argument stands for.
-fn word<T: serde::de::DeserializeOwned>(text: &str, expected: &str) -> Result<T, String> {
-    serde_json::from_value(text.into()).map_err(|_| format!("expected {expected}"))
 }
 
 #[cfg(test)]

@@ -170,7 +170,7 @@ link: {{keys: {}, deadline_ms: 20000}}
     assert_eq!(told.0, Some(0), "{told:?}");
     // Who asks the wrong machine is told the right one.
     let told = command(robot, &["set", "classifier.model=x", "--graph", &robot_part.name]);
-    assert!(told.0 == Some(1) && told.2.contains("runs on machine 'brain': give the command there"), "{told:?}");
+    assert!(told.0 == Some(1) && told.2.contains("runs on machine 'brain': run the command there"), "{told:?}");
     // A recording of a part: no sample is missing.
     let file = folder.path().join("brain.mcap");
     let file = file.to_str().expect("UTF-8");

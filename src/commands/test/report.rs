@@ -7,12 +7,12 @@ use anyhow::Context;
 use quick_xml::events::BytesText;
 use quick_xml::writer::Writer;
 use serde::Deserialize;
-use serde_json::json;
+use serde_json::{Value, json};
 
 use super::case::Case;
 use super::scratch::file_name;
 use crate::commands::{print_line, print_text, write_out};
-use blindgrasp_cli::shard::{Place, merge_files};
+use blindgrasp_cli::shard::{Place, hash, merge_files};
 use blindgrasp_messages::files::read_regular;
 use blindgrasp_operator::text::counted;
 use blindgrasp_replay::checks::Check;
@@ -44,7 +44,8 @@ pub(super) fn print_summary(cases: &[Case], is_json: bool, place: Option<Place>)
             .collect();
         let mut line = json!({"recordings": cases, "n_passed": n_passed, "n_failed": n_failed});
         if let Some(place) = place {
-            line["place"] = serde_json::to_value(place)?;
+            let content_id = hash(line["recordings"].to_string());
+            line["place"] = serde_json::to_value(place.of_output(vec![1; n_passed + n_failed], content_id))?;
         }
         return Ok(print_text(&serde_json::to_string_pretty(&line)?)?);
     }
@@ -75,13 +76,13 @@ pub(super) fn print_summary(cases: &[Case], is_json: bool, place: Option<Place>)
 pub(super) fn merged(paths: &[PathBuf]) -> anyhow::Result<Vec<Case>> {
     #[derive(Deserialize)]
     struct Printed {
-        recordings: Vec<Case>,
+        recordings: Value,
         place: Place,
     }
     merge_files(paths, |path| {
         let printed = serde_json::from_str(&read_regular(path)?);
         let Printed { recordings, place } = printed.context("expected the JSON of test --shard I/N --json")?;
-        Ok((place, recordings))
+        Ok((place, hash(recordings.to_string()), serde_json::from_value(recordings)?))
     })
 }
 

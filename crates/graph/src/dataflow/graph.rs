@@ -177,17 +177,22 @@ pub struct Edge<'a> {
 }
 
 impl Graph {
-    /// A digest of the params of all nodes but for those named `left_out`, and of the files that they name.
-    pub fn content_id(&self, left_out: &str) -> u64 {
+    /// A digest of the nodes: their arguments, inputs and params but for those named `left_out`, with the content of files in
+    /// place of their paths.
+    ///
+    /// # Errors
+    /// A file cannot be read.
+    pub fn content_id(&self, left_out: Option<&str>) -> std::io::Result<u64> {
         let mut hasher = DefaultHasher::new();
         for node in &self.nodes {
-            for (param, value) in node.params.iter().filter(|(param, _)| *param != left_out) {
+            (&node.id, &node.args, format!("{:?}", node.inputs)).hash(&mut hasher);
+            for (param, value) in node.params.iter().filter(|(param, _)| Some(param.as_str()) != left_out) {
                 let file = value.as_str().filter(|path| Path::new(path).is_file());
-                let file = file.and_then(|path| std::fs::read(path).ok());
-                (&node.id, &node.args, param, value.to_string(), file).hash(&mut hasher);
+                let content = file.map_or_else(|| Ok(value.to_string().into_bytes()), std::fs::read)?;
+                (param, content).hash(&mut hasher);
             }
         }
-        hasher.finish()
+        Ok(hasher.finish())
     }
 
     /// The node of this id.

@@ -619,7 +619,7 @@ impl<S: Surroundings> Lifecycle<S> {
         let found = self.members.iter().position(|member| member.node.id == id);
         found.ok_or_else(|| {
             if let Some(machine) = self.link.machine_of(id) {
-                return format!("node '{id}' runs on machine '{machine}': give the command there, as by ssh");
+                return format!("node '{id}' runs on machine '{machine}': run the command there, for example with ssh");
             }
             let known: Vec<_> = self.members.iter().map(|member| member.node.id.as_str()).collect();
             let alike = did_you_mean(id, known.iter().copied()).map(|alike| format!("{alike} ")).unwrap_or_default();

@@ -199,7 +199,7 @@ fn merge(arguments: &Arguments) -> anyhow::Result<Outcome> {
         const NAMES: &str = "objects, trials, attempts, seed, options, model, params of the graph and lift policy";
         if one.is_of_run(other) { None } else { Some(NAMES) }
     });
-    let report = TrialsReport::merge(shards.map_err(|error| anyhow::anyhow!("--merge: {error}"))?);
+    let report = TrialsReport::merge(shards?);
     print_report(arguments, &report)?;
     Ok(Outcome::of(is_late(&report)))
 }

@@ -113,7 +113,7 @@ impl Setup {
 
     /// A digest of the params of all nodes, and of the files that they name: equal in all shards of a run.
     pub(super) fn graph_id(&self) -> anyhow::Result<u64> {
-        Ok(self.graph(Way { obeys: true, name: "" })?.content_id("shard"))
+        Ok(self.graph(Way { obeys: true, name: "" })?.content_id(Some("shard"))?)
     }
 
     /// The checked graph of a way.

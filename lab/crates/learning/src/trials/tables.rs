@@ -93,7 +93,9 @@ impl TrialsReport {
         }
         let mut whole = whole.unwrap_or_default();
         if let Some((idx, n)) = whole.shard.take() {
-            whole.command = whole.command.replace(&format!(" --shard {idx}/{n}"), "");
+            for given in [format!(" --shard {idx}/{n}"), format!(" --shard={idx}/{n}")] {
+                whole.command = whole.command.replace(&given, "");
+            }
         }
         (whole.records_with_gate, whole.records_without_gate) = (in_order(with_gate), in_order(without_gate));
         whole.count();
