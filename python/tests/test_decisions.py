@@ -2,7 +2,9 @@
 
 import importlib.util
 import itertools
+import os
 import sys
+import tempfile
 import threading
 import time
 import types
@@ -212,6 +214,18 @@ class Publishing(unittest.TestCase):
 
 
 class Launch(unittest.TestCase):
+    def setUp(self):
+        folder = tempfile.TemporaryDirectory()
+        self.addCleanup(folder.cleanup)
+        self.addCleanup(os.chdir, os.getcwd())
+        os.chdir(folder.name)
+        Path("flow.yaml").touch()
+        Path("t.yaml").write_text("joints: {topic: /left/joint_states}\ncells: [{topic: /cells}]\n")
+        self.missing = None
+        which = mock.patch("shutil.which", lambda program: None if program == self.missing else program)
+        which.start()
+        self.addCleanup(which.stop)
+
     def started(self, **given):
         """The nodes and commands that the launch file starts, as words."""
         words = lambda kind: lambda **of: [kind, *of.get("cmd", [of.get("executable"), *of.get("arguments", [])])]
@@ -225,13 +239,14 @@ class Launch(unittest.TestCase):
         with mock.patch.dict(sys.modules, modules):
             file = importlib.util.module_from_spec(spec)
             spec.loader.exec_module(file)
+        self.ended = file.graph_has_ended
         *declared, function = file.generate_launch_description()
         return function(Message(launch_configurations={**dict(declared), **given}))
 
     def test_the_options_start_their_nodes(self):
         self.assertEqual(self.started(), [["node", "decisions", "live_gate", "--namespace", "/blindgrasp"]])
         started = self.started(run="flow.yaml", graph="g", table="t.yaml", address="unix:/s", gate="lift")
-        run = ["run", "blindgrasp", "run", "flow.yaml", "--name", "g"]
+        run = ["run", "setpriv", "--pdeathsig", "TERM", "blindgrasp", "run", "flow.yaml", "--name", "g"]
         hand = ["node", "hand", "t.yaml", "--address", "unix:/s"]
         decisions = ["node", "decisions", "g", "--namespace", "/blindgrasp"]
         lift_gate = ["node", "lift_gate", "--ros-args", "--remap", "/blindgrasp/decision:=/blindgrasp/decision"]
@@ -240,16 +255,38 @@ class Launch(unittest.TestCase):
             self.started(gate="arm")
 
     def test_each_hand_has_its_graph_and_its_topics(self):
-        of_left = {"graph": "left", "table": "t.yaml", "namespace": "/left"}
+        of_left = {"graph": "left", "table": "t.yaml", "namespace": "/blindgrasp/left"}
         decisions, hand, lift_gate = self.started(gate="lift", **of_left)
-        self.assertEqual(decisions[2:], ["left", "--namespace", "/left"])
+        self.assertEqual(decisions[2:], ["left", "--namespace", "/blindgrasp/left"])
         self.assertEqual(hand[2:], ["t.yaml", "--graph", "left"])
-        self.assertEqual(lift_gate[-1], "/blindgrasp/decision:=/left/decision")
+        self.assertEqual(lift_gate[-1], "/blindgrasp/decision:=/blindgrasp/left/decision")
         of_gripper = {"gate": "gripper", "controller": "/c", "grasps_below": "0.03", "name": "left_gate"}
         for parallel in ("true", "True"):
             gripper = self.started(parallel=parallel, **of_gripper, **of_left)[-1]
             own = ["--controller", "/c", "--grasps-below", "0.03", "--wait", "3.0", "--name", "left_gate", "--parallel"]
-            self.assertEqual(gripper[2:], [*own, "--decisions", "/left/decision"])
+            self.assertEqual(gripper[2:], [*own, "--decisions", "/blindgrasp/left/decision"])
+
+    def test_nothing_starts_that_would_fail_again_and_again(self):
+        Path("wrong.yaml").write_text("cells: [{}]")
+        for given, says in [
+            ({"run": "none.yaml"}, "run:=none.yaml: there is no such file"),
+            ({"table": "none.yaml"}, "table:=none.yaml: No such file"),
+            ({"table": "wrong.yaml"}, r"table:=wrong.yaml: cells\[0\]: `topic` is missing"),
+            ({"table": "t.yaml", "namespace": "/left/"}, "namespace:=/left: the table reads /left/joint_states there"),
+        ]:
+            with self.assertRaisesRegex(ValueError, says):
+                self.started(**given)
+        for self.missing in ("blindgrasp", "setpriv"):
+            with self.assertRaisesRegex(ValueError, f"the program {self.missing} is not in PATH"):
+                self.started()
+
+    def test_a_failed_graph_is_a_failed_launch(self):
+        self.started()
+        for code in (0, 3):
+            self.assertEqual(self.ended(Message(returncode=code), None).reason, "the graph has ended")
+        for code in (1, -9):
+            with self.assertRaisesRegex(RuntimeError, "the graph has failed"):
+                self.ended(Message(returncode=code), None)
 
     def test_a_gate_of_the_gripper_that_cannot_start_is_refused(self):
         for given in [{"grasps_below": "0.03"}, {"controller": "/c"}, {"controller": "/c", "grasps_below": "0", "grasps_above": "1"}]:
