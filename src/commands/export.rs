@@ -53,7 +53,8 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "I/N", requires = "features")]
     shard: Option<Shard>,
     /// Merge the tables of all shards into that of the whole.
-    #[arg(long, value_name = "FILE", num_args = 1.., requires = "out", conflicts_with_all = ["recordings", "topic", "features", "shard", "hand"])]
+    #[arg(long, value_name = "FILE", num_args = 1.., requires = "out",
+          conflicts_with_all = ["recordings", "topic", "features", "shard", "hand"])]
     merge: Vec<PathBuf>,
     /// Pad layout of the hand, for --features; default: that of the first recording, if its name is a built-in one.
     #[arg(long, requires = "features", add = completions::hands())]
@@ -96,8 +97,8 @@ fn export_features(arguments: &Arguments, model: &Path, out: &Path) -> anyhow::R
         let place = place.of_output(table.readings.iter().map(Vec::len).collect(), hash(&rows));
         let FeatureTable { readings, n_excluded } = &table;
         let placed = PlacedTable { place, readings: readings.concat(), n_excluded: n_excluded.clone() };
-        writeln!(to_file, "{}", serde_json::to_string(&placed)?)?;
-        to_file.write_all(&rows)?;
+        let written = writeln!(to_file, "{}", serde_json::to_string(&placed)?);
+        written.and_then(|()| to_file.write_all(&rows)).with_context(|| out.display().to_string())?;
     }
     to_file.flush().with_context(|| out.display().to_string())?;
     drop(to_file);
@@ -116,8 +117,8 @@ struct PlacedTable {
 }
 
 fn merge_features(arguments: &Arguments, out: &Path) -> anyhow::Result<Outcome> {
-    let file = NewFile::create(out, &arguments.merge, arguments.overwrite)?;
     const EXPECTED: &str = "expected a whole table of export --features --shard I/N";
+    let file = NewFile::create(out, &arguments.merge, arguments.overwrite)?;
     let (mut header, mut n_excluded) = (StringRecord::new(), BTreeMap::new());
     let rows = merge_files(&arguments.merge, |path| {
         let mut text = BufReader::new(open_regular(path)?);

@@ -24,7 +24,7 @@ ARGUMENTS = {
 }
 
 
-# The kernel ends what launch has started if launch is killed.
+# If launch is killed, the kernel ends the processes that it has started.
 DIES_WITH_LAUNCH = ["setpriv", "--pdeathsig", "TERM"]
 
 
