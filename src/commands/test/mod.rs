@@ -119,7 +119,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     if arguments.faults {
         return faults::run(&runner, &recordings, arguments.json);
     }
-    let asked_for = arguments.shard.filter(|_| arguments.json);
+    let asked_for = if arguments.json { arguments.shard } else { None };
     let place = asked_for.map(|shard| place_of(arguments, shard, &runner, &all));
     let mut cases: Vec<Case> = Vec::new();
     for recording in &recordings {
