@@ -11,11 +11,8 @@ const TOOLS: [&str; 4] = ["git", "python3", "readelf", "dpkg-deb"];
 
 #[test]
 fn the_same_program_is_packed_into_the_same_bytes_and_runs_from_them() {
-    if let Some(tool) = TOOLS.iter().find(|tool| output(Command::new(tool).arg("--version")).is_none()) {
-        return skipped(&format!("{tool} is missing"));
-    }
-    if !project().join(".git").exists() {
-        return skipped("the source is no clone of git");
+    if let Some(missing) = missing() {
+        return skipped(&missing);
     }
     let folder = tempfile::tempdir().expect("a folder");
     let (first, second) = (folder.path().join("first"), folder.path().join("second"));
@@ -99,11 +96,8 @@ fn the_package_of_cargo_has_all_files_that_init_writes() {
 /// A maintainer's command, in a clone: mistakes are listed before anything is made, and without --go nothing is tagged.
 #[test]
 fn a_version_is_published_only_if_it_is_the_same_everywhere() {
-    if let Some(tool) = TOOLS.iter().find(|tool| output(Command::new(tool).arg("--version")).is_none()) {
-        return skipped(&format!("{tool} is missing"));
-    }
-    if !project().join(".git").exists() {
-        return skipped("the source is no clone of git");
+    if let Some(missing) = missing() {
+        return skipped(&missing);
     }
     let folder = tempfile::tempdir().expect("a folder");
     let (clone, out) = (folder.path().join("clone"), folder.path().join("dist"));
@@ -169,6 +163,14 @@ fn a_version_is_published_only_if_it_is_the_same_everywhere() {
 fn path_with_python() -> String {
     let others = std::env::var("PATH").unwrap_or_default();
     format!("{}:{others}", python().parent().expect("a folder").display())
+}
+
+/// The part that a release needs and this machine lacks.
+fn missing() -> Option<String> {
+    if let Some(tool) = TOOLS.iter().find(|tool| output(Command::new(tool).arg("--version")).is_none()) {
+        return Some(format!("{tool} is missing"));
+    }
+    if project().join(".git").exists() { None } else { Some("the source is no clone of git".into()) }
 }
 
 /// Packs the program of this build.

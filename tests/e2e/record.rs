@@ -5,7 +5,7 @@ use std::ffi::OsStr;
 use std::io::{BufRead, BufReader, Read};
 use std::os::unix::ffi::OsStrExt;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::process::{Child, Command, Output, Stdio};
 
 use crate::common::{
     FAST_FOREVER, Graph, blindgrasp, dataflow, fails, program, run, signal, skipped, text, wait_until,
@@ -287,6 +287,16 @@ fn a_recording_in_parts_is_whole() {
     graph.stop().assert_undisturbed("recorded in parts");
 }
 
+/// The summary of a run that lost nothing but its recording.
+fn summary_without_recording(output: &Output, file: &str) -> Value {
+    let lines = crate::common::json_lines(&output.stdout);
+    let summary = lines.last().expect("a summary")["summary"].clone();
+    assert_eq!(output.status.code(), Some(3), "{summary} {}", text(&output.stderr));
+    assert_eq!((&summary["samples_lost"], &summary["undecided"]), (&0.into(), &0.into()), "{summary}");
+    assert!(summary["recording_error"].as_str().expect("an error").contains(file), "{summary}");
+    summary
+}
+
 /// The recording lies on a file system of 3 MB that only this test's processes see. Only root can make one.
 #[test]
 fn a_limit_of_file_sizes_ends_the_recording_and_not_the_graph() {
@@ -304,11 +314,7 @@ fn a_limit_of_file_sizes_ends_the_recording_and_not_the_graph() {
         .env("XDG_STATE_HOME", Path::new(env!("CARGO_TARGET_TMPDIR")).join("state"))
         .output()
         .expect("prlimit is there");
-    let lines = crate::common::json_lines(&output.stdout);
-    let summary = &lines.last().expect("a summary")["summary"];
-    assert_eq!(output.status.code(), Some(3), "{summary} {}", text(&output.stderr));
-    assert_eq!((&summary["samples_lost"], &summary["undecided"]), (&0.into(), &0.into()), "{summary}");
-    assert!(summary["recording_error"].as_str().expect("an error").contains("limited.mcap"), "{summary}");
+    summary_without_recording(&output, "limited.mcap");
     crate::common::assert_nothing_left(&name);
 }
 
@@ -349,11 +355,7 @@ fn a_full_disk_ends_the_recording_and_not_the_graph() {
         .arg(&flow)
         .output()
         .expect("started");
-    let lines = crate::common::json_lines(&output.stdout);
-    let summary = &lines.last().expect("a summary")["summary"];
-    assert_eq!(output.status.code(), Some(3), "{summary} {}", text(&output.stderr));
-    assert_eq!((&summary["samples_lost"], &summary["undecided"]), (&0.into(), &0.into()), "{summary}");
-    assert!(summary["recording_error"].as_str().expect("an error").contains("full.mcap"), "{summary}");
+    let summary = summary_without_recording(&output, "full.mcap");
     let n_recorded: u64 = summary["recorded"].as_object().expect("topics").values().filter_map(Value::as_u64).sum();
     let n_received: u64 = summary["edges"]
         .as_array()

@@ -4,7 +4,7 @@ use crate::common::{Graph, json_lines, signal, wait_until};
 use crate::hosts::Network;
 use crate::split::{
     Attacker, FOREVER, assert_lost_nothing, assert_nothing_unsafe, command, decided, keys, node, on_one_machine, part,
-    patient, peer, pid_of, split, stop, strict, wait_for_state,
+    patient, peer, pid_of, split, stop, strict, wait_for_state, with_tls,
 };
 use rustix::process::Signal;
 
@@ -144,16 +144,7 @@ fn a_part_is_swapped_set_and_stopped_while_samples_cross() {
     let [robot, brain] = &network.hosts[..] else { panic!("two hosts") };
     let folder = tempfile::tempdir().expect("a folder");
     let keys = keys(folder.path(), &["--machine", "robot", "--machine", "brain"]);
-    let machines = format!(
-        "machines:
-  robot: {{}}
-  brain: {{listen: tls/{}:7447}}
-link: {{keys: {}, deadline_ms: 20000}}
-",
-        brain.address,
-        keys.display()
-    );
-    let flow = split(folder.path(), &machines, &[patient()]);
+    let flow = split(folder.path(), &with_tls(brain, &keys), &[patient()]);
     let brain_part = part(brain, &flow, "brain", &[]);
     let robot_part = part(robot, &flow, "robot", &FOREVER);
     robot_part.wait_for_decisions(3);
@@ -218,11 +209,7 @@ fn a_part_in_the_middle_of_a_stream_can_be_stopped_without_a_loss() {
     let [robot, brain] = &network.hosts[..] else { panic!("two hosts") };
     let folder = tempfile::tempdir().expect("a folder");
     let keys = keys(folder.path(), &["--machine", "robot", "--machine", "brain"]);
-    let machines = format!(
-        "machines:\n  robot: {{}}\n  brain: {{listen: tls/{}:7447}}\nlink: {{keys: {}}}\n",
-        brain.address,
-        keys.display()
-    );
+    let machines = with_tls(brain, &keys).replace(", deadline_ms: 20000", "");
     let flow = split(folder.path(), &machines, &[patient()]);
     let brain_part = part(brain, &flow, "brain", &[]);
     let robot_part = part(robot, &flow, "robot", &FOREVER);

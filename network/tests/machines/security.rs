@@ -6,7 +6,7 @@ use crate::common::{Graph, signal, unique_name, wait_until};
 use crate::hosts::{Host, Network};
 use crate::split::{
     Attacker, FOREVER, assert_lost_nothing, assert_nothing_unsafe, decided, keys, on_one_machine, part, patient, peer,
-    pid_of, rejected, split, stop, wait_for_state,
+    pid_of, rejected, split, stop, wait_for_state, with_tls,
 };
 use blindgrasp_bridge::wire::PROTOCOL;
 use blindgrasp_graph::link::config::key_files;
@@ -20,15 +20,6 @@ fn open_to_all(brain: &Host) -> String {
     format!(
         "machines:\n  robot: {{}}\n  brain: {{listen: tcp/{}:7447}}\nlink: {{insecure: true, deadline_ms: 20000}}\n",
         brain.address
-    )
-}
-
-fn with_tls(brain: &Host, keys: &Path) -> String {
-    format!(
-        "machines:\n  robot: {{}}\n  brain: {{listen: tls/{}:7447}}\n\
-         link: {{keys: {}, deadline_ms: 20000}}\n",
-        brain.address,
-        keys.display()
     )
 }
 

@@ -175,3 +175,12 @@ impl Drop for Attacker {
         let _ = self.0.wait();
     }
 }
+
+pub(crate) fn with_tls(brain: &Host, keys: &Path) -> String {
+    format!(
+        "machines:\n  robot: {{}}\n  brain: {{listen: tls/{}:7447}}\n\
+         link: {{keys: {}, deadline_ms: 20000}}\n",
+        brain.address,
+        keys.display()
+    )
+}

@@ -105,9 +105,8 @@ fn a_pulled_cable_holds_and_loses_nothing_and_is_reported() {
     let robot_end = stop(robot, robot_part);
     let brain_end = brain_part.finish();
     assert_nothing_unsafe(&robot_end);
-    for (name, end) in [("robot", &robot_end), ("brain", &brain_end)] {
-        assert_lost_nothing(name, end);
-    }
+    assert_lost_nothing("robot", &robot_end);
+    assert_lost_nothing("brain", &brain_end);
 }
 
 #[test]

@@ -93,7 +93,7 @@ pub(super) struct Arguments {
     /// Replace an existing recording.
     #[arg(long, requires = "record")]
     overwrite: bool,
-    /// Write a report with the tables and pictures of some of the trials (HTML).
+    /// Write a report with the tables (HTML), and without --merge pictures of some of the trials.
     #[arg(long, value_name = "FILE")]
     report: Option<PathBuf>,
     /// Make only every N-th trial, from the I-th on (0/N to N-1/N). Trials of a graph that learns from its lifts depend on the
@@ -102,7 +102,7 @@ pub(super) struct Arguments {
     shard: Option<Shard>,
     /// Merge the JSON of all shards into that of the whole.
     #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with_all = ["objects", "trials", "attempts", "seed", "lift_policy",
-          "model", "options", "physics", "dataflow", "name", "overrides", "shard", "record", "report"])]
+          "model", "options", "physics", "dataflow", "name", "overrides", "shard", "record"])]
     merge: Vec<PathBuf>,
     /// Print JSON, with every attempt.
     #[arg(long)]
@@ -129,15 +129,17 @@ struct Way {
     name: &'static str,
 }
 
+const WAYS: [Way; 2] = [Way { obeys: true, name: "with the gate" }, Way { obeys: false, name: "every grasp lifted" }];
+
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     if arguments.print_options {
         print_text(TrialOptions::DEFAULTS.trim_end())?;
         return Ok(Outcome::Done);
     }
+    check_arguments(arguments)?;
     if !arguments.merge.is_empty() {
         return merge(arguments);
     }
-    check_arguments(arguments)?;
     let (targets, warnings) = targets_and_warnings(&arguments.objects)?;
     warnings.iter().for_each(|warning| print_diagnostic(&format!("warning: {warning}")));
     let setup = Setup::new(arguments)?;
@@ -154,7 +156,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     let mut report = empty_report(arguments, &setup)?;
     let mut is_lossy = false;
     let mut failed = None;
-    for way in ways(arguments.lift_policy) {
+    for &way in ways(arguments.lift_policy) {
         match run_way(arguments, &setup, way, &mut report, &n_stops)? {
             Ok(outcome) => is_lossy |= outcome == Outcome::FinishedWithLoss,
             // The trials made so far are shown all the same.
@@ -170,7 +172,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     report.count();
     if let Some(path) = &arguments.report {
         let strips = strips(&setup, &targets, &report, &n_stops);
-        write_report(path, &trials_page(&setup.hand, &report, &strips)?)?;
+        write_report(path, &trials_page(Some(&setup.hand), &report, &strips)?)?;
     }
     print_report(arguments, &report)?;
     is_lossy |= is_late(&report);
@@ -200,6 +202,9 @@ fn merge(arguments: &Arguments) -> anyhow::Result<Outcome> {
         if one.is_of_run(other) { None } else { Some(NAMES) }
     });
     let report = TrialsReport::merge(shards?);
+    if let Some(path) = &arguments.report {
+        write_report(path, &trials_page(None, &report, &[])?)?;
+    }
     print_report(arguments, &report)?;
     Ok(Outcome::of(is_late(&report)))
 }
@@ -238,15 +243,12 @@ fn empty_report(arguments: &Arguments, setup: &Setup) -> anyhow::Result<TrialsRe
 }
 
 /// The ways to make the trials, in the order in which they are run.
-fn ways(policy: LiftPolicy) -> Vec<Way> {
-    let mut ways = Vec::new();
-    if policy != LiftPolicy::Always {
-        ways.push(Way { obeys: true, name: "with the gate" });
+fn ways(policy: LiftPolicy) -> &'static [Way] {
+    match policy {
+        LiftPolicy::Decision => &WAYS[..1],
+        LiftPolicy::Always => &WAYS[1..],
+        LiftPolicy::Both => &WAYS,
     }
-    if policy != LiftPolicy::Decision {
-        ways.push(Way { obeys: false, name: "every grasp lifted" });
-    }
-    ways
 }
 
 /// Runs the graph once, and adds its attempts to the report. The inner result is that of the run.

@@ -44,11 +44,11 @@ struct TrialsPage<'a> {
     made: [(&'static str, &'a str); 6],
 }
 
-/// The page, with strips of this hand.
+/// The page, with strips of the hand, if there are any.
 ///
 /// # Errors
 /// Joints that are not this hand's, or data that cannot be written as JSON.
-pub fn trials_page(hand: &Hand, report: &TrialsReport, strips: &[Strip]) -> Result<String, PictureError> {
+pub fn trials_page(hand: Option<&Hand>, report: &TrialsReport, strips: &[Strip]) -> Result<String, PictureError> {
     let TrialsReport { n_trials, max_attempts, seed, .. } = report;
     let trials = format!("{n_trials}, {max_attempts} attempts each at most, seed {seed}");
     let page = TrialsPage {
@@ -64,9 +64,7 @@ pub fn trials_page(hand: &Hand, report: &TrialsReport, strips: &[Strip]) -> Resu
             ("assumed", "the objects' sizes and their friction; the paper's masses"),
         ],
     };
-    if strips.is_empty() {
-        return report_html(ReportKind::Trials, &page, None);
-    }
+    let (Some(hand), [_, ..]) = (hand, strips) else { return report_html(ReportKind::Trials, &page, None) };
     let stand_radius_m = report.options.physics.stand_radius_m.min(DRAWN_STAND_M);
     let scenes: Vec<_> = strips.iter().map(|strip| (&strip.thing, &strip.moments[..])).collect();
     report_html(ReportKind::Trials, &page, Some(&DrawnFrames::of_scenes(hand, stand_radius_m, &scenes)?))
@@ -237,7 +235,7 @@ mod tests {
                 strip(&hand, target, made, 1, record).expect("a strip")
             })
             .collect();
-        let page = trials_page(&hand, &report, &strips).expect("a page");
+        let page = trials_page(Some(&hand), &report, &strips).expect("a page");
         for expected in [
             "with the gate: 4 reached the object, 3 lifted it, 2 kept it, in 8 attempts.",
             "Of 2 drops, 2 were avoided.",
