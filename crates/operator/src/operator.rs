@@ -75,6 +75,7 @@ pub(crate) struct Group {
     inboxes: Vec<Arc<Inbox>>,
     /// The slots of their inputs.
     input_slots: Vec<usize>,
+    instance_slots: Vec<usize>,
     pub(crate) tasks: RefCell<Vec<Box<dyn Task>>>,
 }
 
@@ -385,9 +386,12 @@ impl Operator {
         }
     }
 
-    /// Gives a sign of life.
+    /// Gives a sign of life, of the other operators of its group as well: while it works, they wait.
     pub fn beat(&self) {
-        self.0.cursors.instance(self.0.wiring.instance_slot).beat(monotonic_nanos());
+        let own = [self.0.wiring.instance_slot];
+        for slot in self.0.group.as_ref().map_or(&own[..], |group| &group.instance_slots) {
+            self.0.cursors.instance(*slot).beat(monotonic_nanos());
+        }
     }
 
     /// Looks, if the operator uses the network, whether strangers' connections hold the descriptors of this process. Call it
@@ -692,7 +696,6 @@ pub(crate) fn run_in_turn(mut tasks: Vec<Box<dyn Task>>) -> anyhow::Result<()> {
         }
         if interrupted.is_none() && first == 0 {
             tasks[0].operator().wait(until);
-            tasks.iter().skip(1).for_each(|task| task.operator().beat());
         }
         first = interrupted.unwrap_or(0);
     }
@@ -729,7 +732,9 @@ pub fn join(descriptions: &[OperatorDescription], wirings: Vec<Wiring>) -> anyho
             .context("cannot listen for signals")?;
     }
     let input_slots = wirings.iter().flat_map(|wiring| wiring.inputs.values()).filter_map(|input| input.slot).collect();
-    let group = is_group.then(|| Rc::new(Group { inboxes: inboxes.clone(), input_slots, tasks: RefCell::default() }));
+    let instance_slots = wirings.iter().map(|wiring| wiring.instance_slot).collect();
+    let group = Group { inboxes: inboxes.clone(), input_slots, instance_slots, tasks: RefCell::default() };
+    let group = is_group.then(|| Rc::new(group));
     let mut operators = Vec::with_capacity(wirings.len());
     for ((wiring, description), inbox) in wirings.into_iter().zip(descriptions).zip(inboxes) {
         let program = identity::of_program(description, &wiring.params);

@@ -109,7 +109,7 @@ struct Limits {
     startup_limit: f64,
     /// Kill operators that have not drained, or exited, after this time
     ///
-    /// When the graph stops, the operators answer the samples that are left, and then exit.
+    /// When the graph stops, operators answer the samples that are left. At a recording's end the time begins again with each answer.
     #[arg(long, value_name = "TIME", default_value = "10", value_parser = |text: &str| secs_in(text, 0.1..=3600.0))]
     grace: f64,
     /// A writer on a lossless edge that waits longer for a reader fails

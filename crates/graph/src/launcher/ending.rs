@@ -5,6 +5,7 @@ use std::time::Duration;
 use crate::control::GraphState;
 use crate::launcher::LaunchError;
 use crate::launcher::lifecycle::{Lifecycle, Surroundings};
+use blindgrasp_operator::cursors::SampleId;
 use blindgrasp_operator::wiring::Command;
 
 /// The operators behind one that has not drained in time get this time.
@@ -16,10 +17,11 @@ pub(super) enum Ending {
     /// It goes on.
     #[default]
     NotBegun,
-    /// The node of this index is asked to drain. The deadline is set once no swap is under way.
+    /// The node of this index is asked to drain, and has answered so far. The deadline is set once no swap is under way.
     Draining {
         idx: usize,
         deadline: Option<Duration>,
+        answered: Option<SampleId>,
     },
     Drained,
     /// All are let go. Those that were asked to drain, and have not, are not waited for.
@@ -57,20 +59,29 @@ impl<S: Surroundings> Lifecycle<S> {
         self.abandon_swap("the graph is stopping");
         self.is_launching = false;
         self.state = GraphState::Stopping;
-        self.ending = Ending::Draining { idx: 0, deadline: None };
+        self.ending = Ending::Draining { idx: 0, deadline: None, answered: None };
     }
 
-    /// Goes on with draining; true once it is over: for all operators within the grace period, and at once if `is_hurried`.
+    /// Goes on with draining; true once it is over: for all operators within the grace period, and at once if `is_hurried`. After
+    /// the last sample of all sources the period begins again with each answer.
     pub(super) fn go_on_draining(&mut self, is_hurried: bool) -> bool {
-        while let Ending::Draining { idx, deadline } = self.ending {
+        while let Ending::Draining { idx, deadline, answered } = self.ending {
             if self.swap.is_some() && !is_hurried {
                 return false;
             }
-            let deadline = deadline.unwrap_or(self.now + self.options.grace);
-            self.ending = Ending::Draining { idx, deadline: Some(deadline) };
             if idx == self.members.len() {
                 self.ending = Ending::Drained;
-            } else if self.drain(idx) {
+                return true;
+            }
+            let last = self.last_answered(idx);
+            let is_stopped = self.is_asked_to_stop || self.link.was_stopped;
+            let goes_on = answered.is_some() && last != answered && !is_stopped;
+            let deadline = match deadline {
+                Some(deadline) if !goes_on => deadline,
+                _ => self.now + self.options.grace,
+            };
+            self.ending = Ending::Draining { idx, deadline: Some(deadline), answered: last };
+            if self.drain(idx) {
                 self.end_node(idx, deadline);
             } else if self.now >= deadline || is_hurried {
                 let what = if is_hurried {
@@ -114,7 +125,7 @@ impl<S: Surroundings> Lifecycle<S> {
 
     /// Tells the other machines that the outputs of a node have ended, and goes on with the next one.
     fn end_node(&mut self, idx: usize, deadline: Duration) {
-        self.ending = Ending::Draining { idx: idx + 1, deadline: Some(deadline) };
+        self.ending = Ending::Draining { idx: idx + 1, deadline: Some(deadline), answered: None };
         let node = self.members[idx].node.id.clone();
         let link = self.members.iter().find(|member| member.node.is_link() && member.node.id != node);
         if let Some(link) = link {

@@ -493,17 +493,17 @@ impl<S: Surroundings> Lifecycle<S> {
             Report::Drained => instance.is_stopped = true,
             Report::Failed { message } => self.on_failure(id, &message),
             // A standby counts what the active process counts as well.
-            Report::Counts { in_all: true, .. } if !is_active => {}
             Report::Counts { counts, in_all: true } => {
                 // Zeros are shown in the place of other counts, and not by themselves.
-                if counts.iter().any(|(name, count)| *count > 0 || member.counts.contains_key(name)) {
+                if is_active && counts.iter().any(|(name, count)| *count > 0 || member.counts.contains_key(name)) {
                     member.counts.extend(counts);
                 }
             }
             Report::Counts { counts, in_all: false } => {
                 for (name, count) in &counts {
                     let before = instance.counts.get(name).copied().unwrap_or(0);
-                    *member.counts.entry(name.clone()).or_default() += count.saturating_sub(before);
+                    let more = if is_active { count.saturating_sub(before) } else { 0 };
+                    *member.counts.entry(name.clone()).or_default() += more;
                 }
                 instance.counts = counts;
             }

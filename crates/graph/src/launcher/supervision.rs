@@ -82,7 +82,9 @@ impl<S: Surroundings> Lifecycle<S> {
             self.kill(active.id, Some("was stopped from outside (SIGTERM)".into()));
         }
         let Some(active) = &self.members[idx].active else { return };
-        let has_done_its_work = active.is_asked && active.is_done;
+        // Not if its process is started again for another node of its group.
+        let is_needed = self.together(idx).iter().any(|mate| self.members[*mate].restart_at.is_some());
+        let has_done_its_work = active.is_asked && active.is_done && !is_needed;
         if !active.is_running() && !has_done_its_work {
             // A process that ends by itself with an error says why.
             let limit = if active.has_exited_in_error() { LOG_DRAIN_LIMIT } else { HEARING };

@@ -700,7 +700,7 @@ impl<S: Surroundings> Lifecycle<S> {
     }
 
     /// The last sample that a node has answered; of a source, the last that it has sent.
-    fn last_answered(&self, idx: usize) -> Option<SampleId> {
+    pub(super) fn last_answered(&self, idx: usize) -> Option<SampleId> {
         let node = &self.members[idx].node;
         let first_input = node.inputs.iter().map(|input| &input.port).min();
         if let Some(input) = first_input
