@@ -18,13 +18,13 @@ spec = mujoco.MjSpec.from_file(str(hands / "parallel-gripper.urdf"))
 spec.compiler.fusestatic = False
 spec.option.gravity = [0.0, 0.0, 0.0]
 for joint in spec.joints:
-    joint.damping = [20.0, 0.0, 0.0]
     motor = spec.add_actuator(target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
     motor.gainprm[0] = 1.0
 ball = spec.worldbody.add_body(name="ball", pos=[0.002, 0.0, 0.043])
 ball.add_freejoint()
 ball.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.02, 0.0, 0.0], mass=0.05, condim=4)
 model = spec.compile()
+model.dof_damping[:2] = 20.0
 data = mujoco.MjData(model)
 
 # %% The skin, and a second in which the jaws close with 5 N.

@@ -86,12 +86,8 @@ def skin(
 
     Raises:
         ProgramError: the program refuses the hand.
-        ValueError: bodies of the model may sleep (`mjENBL_SLEEP`), so that they have no contacts; the model lacks a link of the cells, or its frame lies elsewhere, or an option cannot be.
+        ValueError: bodies of the model may sleep (`mjENBL_SLEEP`), so that they have no contacts; the model lacks a link of the cells, or its frame lies elsewhere, or an option cannot be. `read` raises it, too: for data of a model that may sleep by now, or of another one, as after `spec.recompile`.
     """
-    import mujoco
-
-    if model.opt.enableflags & getattr(mujoco.mjtEnableBit, "mjENBL_SLEEP", 0):
-        raise ValueError("bodies of the model may sleep, and have no contacts then: expected it without mjENBL_SLEEP")
     return Skin(_Places(model, cells_of(fspath(hand)), links or {}, prefix), SkinOptions(**options), seed)
 
 
@@ -140,26 +136,28 @@ class Skin:
     def forces(self, data: mujoco.MjData) -> NDArray[np.float64]:
         """The forces on the cells, newtons: what `read` gives without any of the options but the bell's."""
         places, n_cells = self._places, len(self.names)
+        places.check(data.model)
+        if not data.ncon:
+            return np.zeros(n_cells)
         contact = data.contact
-        parts = places.part_of_geom.take(contact.geom, mode="wrap")
-        if parts.max(initial=-1) < 0:
+        # The solver leaves some contacts out. The rows of the others follow each other, up to the last row.
+        first = contact.efc_address
+        used = (first >= 0).nonzero()[0]
+        newtons = places.newtons(first.take(used), data.efc_force)
+        parts = places.part_of_geom.take(contact.geom.take(used, 0), mode="wrap")
+        at, side = ((parts >= 0) & (newtons > 0.0)[:, None]).nonzero()
+        if not len(at):
             return np.zeros(n_cells)
-        newtons = places.newtons(contact, data.efc_force)
-        parts[newtons <= 0.0] = -1
-        pressed = (parts.ravel() >= 0).nonzero()[0]
-        if not len(pressed):
-            return np.zeros(n_cells)
-        part, newtons = parts.take(pressed), newtons.take(pressed >> 1)
+        part, newtons, pressed = parts[at, side], newtons.take(at), used.take(at)
         body = places.bodies.take(part)
-        # (n_contacts, 2 sides, 2, 3): the point on the other body's surface and the normal out of the side's own body.
-        # MuJoCo's normal goes from the first body to the second one, its place is in the middle between the surfaces.
-        sides = np.empty((len(contact.pos), 2, 2, 3))
-        normals = np.multiply(contact.frame[:, None, :3], places.signs, sides[:, :, 1])
-        np.add(contact.pos[:, None], normals * (0.5 * contact.dist)[:, None, None], sides[:, :, 0])
-        in_world = sides.reshape(-1, 2, 3).take(pressed, 0)
-        in_world[:, 0] -= data.xpos.take(body, 0)
+        # (n_pressed, 2, 3): the point on the other body's surface and the normal out of the side's own body. MuJoCo's
+        # normal goes from the first body to the second one, its place is in the middle between the surfaces.
+        in_world = np.empty((len(part), 2, 3))
+        normal = np.multiply(contact.frame[:, :3].take(pressed, 0), places.signs.take(side, 0), in_world[:, 1])
+        point = contact.pos.take(pressed, 0) + normal * (0.5 * contact.dist.take(pressed))[:, None]
+        np.subtract(point, data.xpos.take(body, 0), in_world[:, 0])
         in_part = in_world @ data.xmat.take(body, 0).reshape(-1, 3, 3)
-        # (n_contacts, 5, n_cells of a part): the ends of each cell along its length and its width, and its normal.
+        # (n_pressed, 5, n_cells of a part): the ends of each cell along its length and its width, and its normal.
         on_axes = (in_part @ places.axes.take(part, 0)).reshape(len(part), 2, 5, -1)
         beside, facing = on_axes[:, 0] - places.offsets.take(part, 0), on_axes[:, 1, 4]
         per_scale = SIGMA_PER_SCALE / self._options.bell_m * newtons**-0.25
@@ -222,18 +220,23 @@ class _Places:
         self.part_of_geom = np.append(part_of_number[numbers[model.geom_bodyid]], -1)
         self.signs = np.array([[1.0], [-1.0]])
         self._model, self._elliptic = model, int(mujoco.mjtCone.mjCONE_ELLIPTIC)
+        self._sleep = int(getattr(mujoco.mjtEnableBit, "mjENBL_SLEEP", 0))
+        self._size = (model.nbody, model.ngeom)
+        self.check(model)
 
-    def newtons(self, contact: Any, efc_force: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The force of each contact at right angles to its surfaces; 0 of one that the solver leaves out."""
-        first = contact.efc_address
-        used = first >= 0
-        newtons = np.zeros(len(first))
+    def check(self, model: mujoco.MjModel) -> None:
+        """Refuses data whose model would silently read as zeros."""
+        if model.opt.enableflags & self._sleep:
+            raise ValueError("bodies of the model may sleep, and have no contacts then: expected it without mjENBL_SLEEP")
+        if (model.nbody, model.ngeom) != self._size:
+            raise ValueError("the data is of another model than the skin: expected a new skin for each compiled model")
+
+    def newtons(self, first: NDArray[np.int32], efc_force: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The force at right angles to the surfaces of the contacts with these first rows."""
         if self._model.opt.cone == self._elliptic:
-            newtons[used] = efc_force[first[used]]
-        elif used.any():
-            # It is the sum over the edges of a pyramid. The rows of contacts follow each other, up to the last row.
-            newtons[used] = np.add.reduceat(efc_force, first[used])
-        return newtons
+            return efc_force.take(first)
+        # It is the sum over the edges of a pyramid.
+        return np.add.reduceat(efc_force, first)
 
 
 def _quoted(names: Any) -> str:
@@ -257,15 +260,15 @@ def _frame(model: mujoco.MjModel, data: mujoco.MjData, name: str, link: str) -> 
 
 
 def _check_place(model: mujoco.MjModel, data: mujoco.MjData, geoms: Any, in_world: Any, link: str) -> None:
-    """Refuses a link whose cells all lie where no contact of the shapes of its body reaches them."""
-    nearest_m = np.inf
+    """Refuses a link with cells that lie where no contact of the shapes of its body reaches them."""
+    beside_m = np.full(len(in_world), np.inf)
     for geom in geoms:
         in_geom = (in_world - data.geom_xpos[geom]) @ data.geom_xmat[geom].reshape(3, 3)
         centre, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
         outside_m = np.linalg.norm(np.maximum(np.abs(in_geom - centre) - half, 0.0), axis=1)
-        nearest_m = min(nearest_m, outside_m.min())
-    if nearest_m > CELL_DEPTH_M:
+        beside_m = np.minimum(beside_m, outside_m)
+    if beside_m.max() > CELL_DEPTH_M:
         raise ValueError(
-            f"the nearest cell of link '{link}' lies {nearest_m * 1e3:.0f} mm beside all shapes of its body, expected at "
-            f"most {CELL_DEPTH_M * 1e3:.0f} mm: if the body's frame is not the link's, name in links a site that has it"
+            f"a cell of link '{link}' lies {beside_m.max() * 1e3:.0f} mm beside all shapes of its body, expected at most "
+            f"{CELL_DEPTH_M * 1e3:.0f} mm: if the body's frame is not the link's, name in links a site that has it"
         )

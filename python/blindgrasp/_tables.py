@@ -71,7 +71,7 @@ def cells_of(hand: str) -> list[dict[str, Any]]:
 
     Raises ProgramError if there is no such hand.
     """
-    cells = answer_of(["info", hand, "--json"])
+    cells = answer_of(["info", "--json", "--", hand])
     if not isinstance(cells, list):
         raise ValueError(f"{hand} is no hand: expected the name of a built-in hand, or the path of a pad layout (YAML)")
     return cells

@@ -203,6 +203,24 @@ class Skin(unittest.TestCase):
             return
         with self.assertRaisesRegex(ValueError, "may sleep, .* expected it without mjENBL_SLEEP"):
             blindgrasp.skin(model, GRIPPER)
+        with self.assertRaisesRegex(ValueError, "may sleep"):
+            skin.read(data)
+
+    def test_data_of_another_model_and_words_that_are_no_hand_are_refused(self):
+        import mujoco
+
+        model, data = squeezed()
+        skin = blindgrasp.skin(model, GRIPPER)
+        other = mujoco.MjData(mujoco.MjModel.from_xml_string("<mujoco/>"))
+        with self.assertRaisesRegex(ValueError, "another model than the skin: expected a new skin"):
+            skin.read(other)
+        with self.assertRaisesRegex(blindgrasp.ProgramError, "--help"):
+            blindgrasp.skin(model, "--help")
+        # MuJoCo compiles each built-in hand.
+        for urdf in (REPOSITORY / "hands").glob("*.urdf"):
+            spec = mujoco.MjSpec.from_file(str(urdf))
+            spec.compiler.fusestatic = False
+            self.assertGreater(spec.compile().nbody, 2)
 
     def test_the_example_closes_a_gripper_on_a_ball(self):
         command = [sys.executable, REPOSITORY / "examples/mujoco_skin.py"]
