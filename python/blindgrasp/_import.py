@@ -33,7 +33,7 @@ def from_table(
     stable_value: object = True,
     group: str = "object",
     class_column: str | None = None,
-    day: str | None = None,
+    day: object = None,
     day_column: str | None = None,
     grasp_column: str | None = None,
     phase_column: str | None = None,
@@ -86,10 +86,9 @@ def from_table(
 
 def _write(table: Any, path: Path) -> None:
     """Writes the table as the CSV that the import reads."""
-    if hasattr(table, "to_csv"):
-        table.to_csv(path, index=False)
-        return
-    if isinstance(table, Mapping):
+    if hasattr(table, "itertuples"):
+        names, rows = list(table.columns), table.itertuples(index=False, name=None)
+    elif isinstance(table, Mapping):
         lengths = {name: len(values) for name, values in table.items()}
         if len(set(lengths.values())) > 1:
             raise ValueError(f"expected columns that are equally long; found lengths {lengths}")
@@ -109,9 +108,14 @@ def _write(table: Any, path: Path) -> None:
 
 
 def _text(value: object) -> str:
-    text = str(value)
+    # A cell of MATLAB or HDF5 is an array of one value, and a text may be bytes.
+    if getattr(value, "size", 0) == 1 and hasattr(value, "ndim") and value.ndim:
+        value = value.item()
+    if getattr(value, "ndim", 0) or isinstance(value, (list, tuple, dict)):
+        raise TypeError(f"expected one value in each column of a row, found {value!r}")
+    text = value.decode() if isinstance(value, bytes) else str(value)
     return "" if text in MISSING else text
 
 
-def _listed(names: str | Sequence[str]) -> str:
-    return names if isinstance(names, str) else ",".join(names)
+def _listed(names: str | Sequence[object]) -> str:
+    return names if isinstance(names, str) else ",".join(map(str, names))

@@ -5,6 +5,7 @@ The recordings are read twice, because all grasps get the same columns. Memory h
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import itertools
 import json
@@ -56,7 +57,11 @@ DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 
 
 def to_parquet(
-    recordings: Source | Sequence[Source], out: str | PathLike[str], *, hand: str | PathLike[str] | None = None
+    recordings: Source | Sequence[Source],
+    out: str | PathLike[str],
+    *,
+    hand: str | PathLike[str] | None = None,
+    overwrite: bool = False,
 ) -> None:
     """Writes the frames of recordings to a Parquet file, a row for each frame.
 
@@ -66,10 +71,17 @@ def to_parquet(
     graph predicted of the frame); then `joint_0`, …, `cell_0`, … (with `hand`, as in `Recording.to_frame`,
     `cell_palm_0`) and the other senses. Unknown values are missing. `from_parquet` reads it back.
 
-    Raises ModuleNotFoundError without pyarrow, and ValueError if the recordings are of different hands or one is given twice.
+    Raises ModuleNotFoundError without pyarrow, FileExistsError if the file exists, ValueError if it is one of the recordings,
+    if they are of different hands or one is given twice, and ProgramError if a folder is not whole.
     """
     pa = _pyarrow()
-    data = _DataSet(recordings, hand)
+    path = Path(fspath(out))
+    if os.path.lexists(path) and not overwrite:
+        raise FileExistsError(f"{path}: the file exists: name another one, or say overwrite=True")
+    found = _recordings(recordings, hand)
+    if path.exists() and any(path.samefile(recording.path) for recording in found):
+        raise ValueError(f"{path} is an input: writing there would destroy it")
+    data = _DataSet(found, hand)
     kinds = OF_GRASP | {"grasp": "int64", "seq": "uint64", "stamp_nanos": "int64", "phase": "string"}
     kinds["predicted"] = "float64"
     names = {sense: [f"{sense}_{name}" for name in data.names(sense)] for sense in data.widths}
@@ -91,8 +103,7 @@ def to_parquet(
                     columns |= dict(zip(of_sense, data.rows(grasp, sense).T))
                 yield pa.table(columns, schema)
 
-    path = Path(fspath(out))
-    partial = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    partial = _partial(path)
     try:
         _write(partial, schema, tables())
         os.replace(partial, path)
@@ -114,13 +125,17 @@ def to_lerobot(
     Raises as `to_parquet`, and FileExistsError if the folder exists.
     """
     pa = _pyarrow()
-    dataset = _LeRobot(pa, _DataSet(recordings, hand))
     root = Path(fspath(out))
-    root.mkdir()
+    if os.path.lexists(root):
+        raise FileExistsError(f"{root} exists: name another folder")
+    dataset = _LeRobot(pa, _DataSet(_recordings(recordings, hand), hand))
+    partial = _partial(root)
+    partial.mkdir()
     try:
-        dataset.write(root)
+        dataset.write(partial)
+        os.rename(partial, root)
     except BaseException:
-        shutil.rmtree(root)
+        shutil.rmtree(partial)
         raise
 
 
@@ -166,9 +181,13 @@ def _write_recordings(
             # The recording says that it was made of a file of this name.
             lines, to = Path(lines_in) / Path(name).name, Path(unfinished) / name
             to.parent.mkdir(parents=True, exist_ok=True)
-            with lines.open("w", encoding="utf-8") as stream:
+            with _named(lines), lines.open("w", encoding="utf-8") as stream:
                 layout = _write_lines(path, of_recording, stream)
-            answer_of(["import", str(lines), "--lines", "--json", f"--hand={layout if hand is None else fspath(hand)}", f"--out={to}"])
+            words = ["--lines", "--json", f"--hand={layout if hand is None else fspath(hand)}", f"--out={to}"]
+            try:
+                answer_of(["import", str(lines), *words])
+            except ProgramError as error:
+                raise _placed(error, lines, f"{path}, recording {name}") or error from None
             names.append(name)
         if not names:
             raise ValueError(f"{path}: expected frames, found none")
@@ -178,9 +197,18 @@ def _write_recordings(
     return names
 
 
+def _placed(error: ProgramError, lines: Path, place: str) -> ValueError | None:
+    """The error of a line of a file that is deleted, as one of its grasp."""
+    found = re.search(rf"{re.escape(str(lines))}, line (\d+): (.*)", error.stderr, re.DOTALL)
+    if not found:
+        return None
+    line = json.loads(lines.read_text(encoding="utf-8").splitlines()[int(found[1]) - 1])
+    return ValueError(f"{place}, grasp {line['data']['grasp_id']} ({line['topic']}): {found[2].strip()}")
+
+
 def _rows_of_file(pa: Any, path: Path, hand: str | PathLike[str] | None) -> Iterator[dict[str, Any]]:
     """Frames as dicts: the values of the grasp, `seq`, `stamp_nanos`, `phase`, and the values of each sense as a list."""
-    with pa.parquet.ParquetFile(path) as file:
+    with _opened(pa, path) as file:
         found = file.schema_arrow.names
         _check(path, {*NEEDED, "recording", "hand", "grasp", "seq", "stamp_nanos", "phase"}, found)
         columns: dict[str, list[str]] = {}
@@ -221,7 +249,7 @@ def _rows_of_dataset(pa: Any, root: Path) -> Iterator[dict[str, Any]]:
         )
     sense_of = {"observation.state": "joint", "observation.tactile": "cell"}
     for path in files:
-        with pa.parquet.ParquetFile(path) as file:
+        with _opened(pa, path) as file:
             _check(path, {"episode_index", "seq", "stamp_nanos", "phase"}, file.schema_arrow.names)
             for batch in file.iter_batches(1000):
                 for row in batch.to_pylist():
@@ -231,6 +259,13 @@ def _rows_of_dataset(pa: Any, root: Path) -> Iterator[dict[str, Any]]:
                     values = {name: value if isinstance(value, list) else [value] for name, value in observed.items()}
                     senses = {sense_of.get(name, name.removeprefix("observation.")): value for name, value in values.items()}
                     yield row | episodes[row["episode_index"]] | {"grasp": row["episode_index"], "senses": senses}
+
+
+def _opened(pa: Any, path: Path) -> Any:
+    try:
+        return pa.parquet.ParquetFile(path)
+    except pa.ArrowInvalid as error:
+        raise ValueError(f"{path}: expected a Parquet file: {error}") from error
 
 
 def _check(path: Path, expected: set[str], found: Sequence[str]) -> None:
@@ -328,10 +363,26 @@ def _pyarrow() -> Any:
     return importlib.import_module("pyarrow")
 
 
+def _partial(path: Path) -> Path:
+    """Where a file or folder is written that gets its name when it is whole."""
+    return path.with_name(f".{path.name}.{os.getpid()}.tmp")
+
+
+@contextlib.contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Names the file in errors of the disk that do not."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is not None:
+            raise
+        raise OSError(error.errno, error.strerror, fspath(path)) from error
+
+
 def _write(path: Path, schema: Any, tables: Iterator[Any]) -> None:
     pa = _pyarrow()
     path.parent.mkdir(parents=True, exist_ok=True)
-    with pa.parquet.ParquetWriter(path, schema) as writer:
+    with _named(path), pa.parquet.ParquetWriter(path, schema) as writer:
         waiting, n_waiting = [schema.empty_table()], 0
         for table in tables:
             waiting.append(table)
@@ -371,18 +422,21 @@ def _of_grasp(name: str, recording: Recording, grasp: Grasp) -> dict[str, Any]:
     }
 
 
+def _recordings(recordings: Source | Sequence[Source], hand: str | PathLike[str] | None) -> list[Recording]:
+    """The recordings that are named. The program lists those of folders, and refuses folders that are not whole."""
+    given = [recordings] if isinstance(recordings, (str, PathLike, Recording)) else recordings
+    opened = {fspath(source.path): source for source in given if isinstance(source, Recording)}
+    paths = [fspath(source.path if isinstance(source, Recording) else source) for source in given]
+    if any(map(os.path.isdir, paths)):
+        words = [] if hand is None else [f"--hand={fspath(hand)}"]
+        paths = answer_of(["info", "--json", *words, "--", *paths])["recordings"]
+    return [opened[path] if path in opened else Recording(path) for path in paths]
+
+
 class _DataSet:
     """Recordings of one hand, and the number of values that each sense has in them."""
 
-    def __init__(self, recordings: Source | Sequence[Source], hand: str | PathLike[str] | None) -> None:
-        given = [recordings] if isinstance(recordings, (str, PathLike, Recording)) else recordings
-        found: list[Recording] = []
-        for source in given:
-            if isinstance(source, Recording):
-                found.append(source)
-                continue
-            path = Path(fspath(source))
-            found += map(Recording, sorted(path.glob("*.mcap")) if path.is_dir() else [path])
+    def __init__(self, found: list[Recording], hand: str | PathLike[str] | None) -> None:
         # Files of one name, as parts of several folders, have the names of their folders before it.
         paths = [recording.path.resolve() for recording in found]
         names = [recording.path.name for recording in found]

@@ -319,7 +319,9 @@ class Recording:
                 if message.fault == 0:
                     known.predictions[message.header.epoch, message.header.seq] = message.probability_stable
             elif topic == "/outcome":
-                known.outcomes[key] = {name: value for name, value in vars(message).items() if name != "header"}
+                # Of two outcomes of a grasp, a drop counts.
+                if key not in known.outcomes or known.outcomes[key]["held"] or not known.outcomes[key]["lifted"]:
+                    known.outcomes[key] = {name: value for name, value in vars(message).items() if name != "header"}
             elif key in labels and not (labels[key].is_stable and not message.stable):
                 raise RecordingError(f"{self.path}: grasp {key[1]} has two labels (/truth)")
             else:

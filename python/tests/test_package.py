@@ -4,6 +4,7 @@
 """
 
 import contextlib
+import datetime
 import importlib.util
 import io
 import json
@@ -252,6 +253,10 @@ class Recordings(Folder):
         frames.to_parquet(path)
         [again] = blindgrasp.from_parquet(path, self.folder / "again", overwrite=True)
         self.assert_same(grasps, again)
+        with self.assertRaisesRegex(FileExistsError, "overwrite=True"):
+            blindgrasp.to_parquet(recording, path)
+        with self.assertRaisesRegex(ValueError, "outcome.mcap is an input: writing there would destroy it"):
+            blindgrasp.to_parquet(self.folder, recording, overwrite=True)
         frames.assign(recording=None).to_parquet(path)
         with self.assertRaisesRegex(ValueError, "names of different files in the column recording, found None"):
             blindgrasp.from_parquet(path, self.folder / "nameless")
@@ -262,6 +267,8 @@ class Recordings(Folder):
             ({"grasp": 0}, "grasp_id changes from 0 to 1 within the grasp"),
             ({"seq": frames["seq"] + 0.5}, "the column seq has 0.5, expected a whole number"),
             ({"phase": "setled"}, "the column phase has 'setled', expected one of open"),
+            ({"cell_palm_0": np.inf}, r"outcome.mcap, grasp 0 \(/tactile\): "),
+            ({"label": "foo"}, r"outcome.mcap, grasp 0 \(/truth\): "),
         ):
             with self.subTest(says=says):
                 frames.assign(**edited).to_parquet(path)
@@ -328,15 +335,15 @@ class Recordings(Folder):
         copied = self.folder / "copied" / recording.name
         copied.parent.mkdir()
         copied.write_bytes(recording.read_bytes())
-        blindgrasp.to_parquet([recording, copied], path)
+        blindgrasp.to_parquet([recording, copied], path, overwrite=True)
         both = blindgrasp.from_parquet(path, self.folder / "both")
         self.assertEqual([again.path.relative_to(self.folder / "both").as_posix() for again in both], ["own.mcap", "copied/own.mcap"])
         for again in both:
             self.assert_same(grasps, again)
         with self.assertRaisesRegex(ValueError, "expected different recordings, found own.mcap twice"):
-            blindgrasp.to_parquet([recording, recording], path)
+            blindgrasp.to_parquet([recording, recording], path, overwrite=True)
         # pandas adds an index, and a user columns.
-        blindgrasp.to_parquet(recording, path, hand="barrett-bh8-280")
+        blindgrasp.to_parquet(recording, path, hand="barrett-bh8-280", overwrite=True)
         table = pd.read_parquet(path)
         table = table[sorted(table.columns)][table["grasp_id"] == 1].assign(note="text", weight_kg=0.5)
         table.to_parquet(path)
@@ -361,10 +368,22 @@ class Recordings(Folder):
         self.assertEqual([len(grasp.seq) for grasp in copied], [len(grasp.seq) for grasp in blindgrasp.read(recording) for _ in range(2)])
 
     def test_recordings_of_two_hands_are_no_data_set(self):
-        for recordings in (self.folder, [ORDINARY, REPOSITORY / "recordings/other-hand.mcap"]):
-            with self.assertRaisesRegex(ValueError, "expected recordings of one hand, found"):
-                blindgrasp.to_parquet(recordings, self.folder / "frames.parquet")
+        with self.assertRaisesRegex(ValueError, "expected recordings of one hand, found"):
+            blindgrasp.to_parquet([ORDINARY, REPOSITORY / "recordings/other-hand.mcap"], self.folder / "frames.parquet")
+        with self.assertRaisesRegex(blindgrasp.ProgramError, "there is no recording in this folder"):
+            blindgrasp.to_parquet(self.folder, self.folder / "frames.parquet")
         self.assertEqual(list(self.folder.iterdir()), [])
+        # A folder is what it is to the commands.
+        copied = self.folder / "one.mcap"
+        copied.write_bytes(ORDINARY.read_bytes())
+        compressed = self.folder / "two.mcap.zstd"
+        compressed.touch()
+        with self.assertRaisesRegex(blindgrasp.ProgramError, "two.mcap.zstd is compressed: unpack it"):
+            blindgrasp.to_lerobot(self.folder, self.folder / "dataset")
+        compressed.unlink()
+        blindgrasp.to_lerobot([self.folder], self.folder / "dataset")
+        with self.assertRaisesRegex(FileExistsError, "dataset exists: name another folder"):
+            blindgrasp.to_lerobot(self.folder, self.folder / "dataset")
 
     def test_the_cells_of_a_table_have_the_names_of_the_pads(self):
         recording = blindgrasp.Recording(ORDINARY)
@@ -942,7 +961,9 @@ class Tables(Folder):
         columns = self.columns()
         rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
         arrays = {name: np.array(values) for name, values in columns.items()}
-        for table in (columns, arrays, rows, iter(rows), pd.DataFrame(columns)):
+        # As HDF5 and MATLAB have names.
+        stored = columns | {"thing": [columns["thing"][0].encode(), *(np.array([name]) for name in columns["thing"][1:])]}
+        for table in (columns, arrays, rows, iter(rows), pd.DataFrame(columns), stored, pd.DataFrame(stored)):
             grasps = list(self.from_table(table, overwrite=True))
             self.assertEqual([grasp.label.object_id for grasp in grasps], columns["thing"])
             self.assertEqual([grasp.label.is_stable for grasp in grasps], columns["held"])
@@ -957,6 +978,17 @@ class Tables(Folder):
         first, second = self.from_table(table, joints={"jaw": 0.015}, **more)
         self.assertEqual((first.grasp_id, first.phase.tolist(), first.label.is_stable), (40, ["closing", "settled"], False))
         self.assertEqual((second.grasp_id, second.joints.tolist(), second.label.is_stable), (41, [[0.015]], True))
+
+    def test_a_day_is_one_session_in_each_form(self):
+        days = ["2026-11-24", "2026-11-24 10:00:01", datetime.date(2026, 11, 24), pd.Timestamp("2026-11-24"), 20261124.0]
+        for day in [*days, np.datetime64("2026-11-24", "ns")]:
+            with self.subTest(day=day):
+                columns = self.columns() | {"when": [day] * 3}
+                for table in (columns, pd.DataFrame(columns)):
+                    found = self.from_table(table, day_column="when", overwrite=True)
+                    self.assertEqual({grasp.day for grasp in found}, {20261124})
+                found = self.from_table(self.columns(), day=day, overwrite=True)
+                self.assertEqual({grasp.day for grasp in found}, {20261124})
 
     def test_what_is_missing_is_no_name_and_no_number(self):
         for missing in (None, math.nan, np.float32("nan"), pd.NA, pd.NaT):
@@ -973,6 +1005,10 @@ class Tables(Folder):
             self.from_table([1, 2])
         with self.assertRaisesRegex(ValueError, "equally long; found lengths .*'jaw': 1"):
             self.from_table(self.columns() | {"jaw": [0.01]})
+        with self.assertRaisesRegex(TypeError, r"expected one value in each column of a row, found \[1, 2\]"):
+            self.from_table(self.columns() | {"jaw": [[1, 2]] * 3})
+        with self.assertRaisesRegex(blindgrasp.ProgramError, "a value is required for '--day"):
+            self.from_table(self.columns(), day="")
         with self.assertRaisesRegex(blindgrasp.ProgramError, "table.csv: the table is empty|there is no row"):
             self.from_table([])
         self.from_table(self.columns())

@@ -62,10 +62,13 @@ pub(super) struct Arguments {
 }
 
 pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
-    match (&arguments.features, &arguments.out) {
-        (Some(model), Some(out)) => return export_features(arguments, model, out),
-        (None, Some(out)) if !arguments.merge.is_empty() => return merge_features(arguments, out),
-        _ => {}
+    let made = match (&arguments.features, &arguments.out) {
+        (Some(model), Some(out)) => Some(export_features(arguments, model, out)),
+        (None, Some(out)) if !arguments.merge.is_empty() => Some(merge_features(arguments, out)),
+        _ => None,
+    };
+    if let (Some(made), Some(out)) = (made, &arguments.out) {
+        return made.with_context(|| format!("cannot make {}", out.display()));
     }
     let [recording] = arguments.recordings.as_slice() else {
         anyhow::bail!("{} recordings: expected one; only --features takes several", arguments.recordings.len());
@@ -97,10 +100,10 @@ fn export_features(arguments: &Arguments, model: &Path, out: &Path) -> anyhow::R
         let place = place.of_output(table.readings.iter().map(Vec::len).collect(), hash(&rows));
         let FeatureTable { readings, n_excluded } = &table;
         let placed = PlacedTable { place, readings: readings.concat(), n_excluded: n_excluded.clone() };
-        let written = writeln!(to_file, "{}", serde_json::to_string(&placed)?);
-        written.and_then(|()| to_file.write_all(&rows)).with_context(|| out.display().to_string())?;
+        writeln!(to_file, "{}", serde_json::to_string(&placed)?)?;
+        to_file.write_all(&rows)?;
     }
-    to_file.flush().with_context(|| out.display().to_string())?;
+    to_file.flush()?;
     drop(to_file);
     file.finish()?;
     print_table(out, &table, model.features.len())

@@ -13,7 +13,7 @@ use blindgrasp_grasps::dataset::{REPORT_METADATA, hand_of_all};
 use blindgrasp_grasps::summary::{Overview, RecordingsSummary};
 use blindgrasp_operator::diagnostics::print_diagnostic;
 use blindgrasp_operator::text::{counted, did_you_mean};
-use blindgrasp_recording::{RecordingIndex, RepairReport, recordings_in, repair};
+use blindgrasp_recording::{RepairReport, recordings_in, repair};
 use blindgrasp_stages::hand::{Hand, builtin_names};
 use blindgrasp_stages::label::Label;
 
@@ -76,11 +76,7 @@ pub(super) fn run(arguments: &Arguments) -> anyhow::Result<Outcome> {
     if arguments.repair {
         return repair_all(&recordings, arguments.json);
     }
-    let mut indexes = Vec::new();
-    for path in &recordings {
-        indexes.push(RecordingIndex::open(path)?);
-    }
-    let overview = Overview::of(indexes);
+    let overview = Overview::of(&recordings)?;
     if overview.n_file_bytes > MAX_READ_BYTES && !arguments.full {
         if arguments.json {
             print_text(&serde_json::to_string_pretty(&overview)?)?;
@@ -173,7 +169,7 @@ fn overview_lines(overview: &Overview) -> Vec<(&str, String)> {
     let [on_disk_mib, raw_mib] =
         [overview.n_file_bytes, overview.n_uncompressed_bytes].map(|n_bytes| n_bytes as f64 / f64::from(1 << 20));
     let mut lines = vec![
-        ("recordings", overview.n_recordings.to_string()),
+        ("recordings", overview.recordings.len().to_string()),
         ("hand", overview.hand.clone()),
         ("samples", samples.collect::<Vec<String>>().join(", ")),
         ("duration", overview.duration_secs.map_or("unknown".into(), |secs| format!("{secs:.1} s"))),

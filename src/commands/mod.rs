@@ -85,19 +85,6 @@ mod tests {
     }
 
     #[test]
-    fn a_word_of_another_program_is_answered_with_a_command_that_there_is() {
-        let all = command();
-        for (word, hint) in hints::WORDS {
-            let name = hint.split(' ').next().unwrap_or_default();
-            assert!(all.find_subcommand(name).is_some(), "there is no '{name}'");
-            let text = told(word);
-            assert!(text.contains(&format!("tip: use 'blindgrasp {hint}'")), "{word}: {text}");
-            assert!(!text.contains("similar"), "{word}: {text}");
-        }
-        assert!(told("topic list").contains("'blindgrasp ps'"));
-    }
-
-    #[test]
     fn mistakes_are_likened_and_unknown_words_get_no_false_hint() {
         for (line, expected) in [
             ("evalute m.json", "tip: did you mean 'evaluate'?"),

@@ -1,4 +1,4 @@
-//! The hint for a word that is no command here: people type what other programs call it.
+//! The hint after a mistake in the command line.
 
 use std::error::Error as _;
 use std::ffi::OsString;
@@ -8,20 +8,6 @@ use blindgrasp_messages::file_kind::FileKind;
 use blindgrasp_operator::text::{did_you_mean, quote};
 use clap::error::{ContextKind, ContextValue, ErrorKind};
 use clap::{Arg, Command};
-
-/// The words of ROS 2, each with the command that does it here.
-pub const WORDS: [(&str, &str); 10] = [
-    ("launch", "run"),
-    ("node", "ps"),
-    ("topic echo", "echo NODE/PORT"),
-    ("topic hz", "top"),
-    ("topic pub", "replay RECORDING"),
-    ("topic", "ps"),
-    ("param", "set"),
-    ("bag record", "record --out FILE"),
-    ("bag play", "replay RECORDING"),
-    ("bag", "info RECORDING"),
-];
 
 /// The error with a hint: the command or the option that is probably meant.
 ///
@@ -39,7 +25,7 @@ pub fn with_hint(mut error: clap::Error, mut root: Command, words: &[OsString]) 
     let hint = match error.kind() {
         ErrorKind::InvalidSubcommand => {
             error.remove(ContextKind::SuggestedSubcommand);
-            command_hint(command, &words.next().unwrap_or_default(), &words.next().unwrap_or_default())
+            command_hint(command, &words.next().unwrap_or_default())
         }
         ErrorKind::UnknownArgument => {
             // Clap advises to pass the option as a value, '-- --x', and likens names that are not alike.
@@ -61,19 +47,10 @@ pub fn with_hint(mut error: clap::Error, mut root: Command, words: &[OsString]) 
     error
 }
 
-/// The hint for a word in the place of a command, and the word behind it.
-fn command_hint(command: &Command, word: &str, next: &str) -> Option<String> {
-    let both = format!("{word} {next}");
-    let is_first = command.get_name() == "blindgrasp";
-    for guess in [both.as_str(), word] {
-        if let Some((_, command)) = WORDS.iter().find(|(known, _)| *known == guess)
-            && is_first
-        {
-            return Some(format!("use 'blindgrasp {command}'"));
-        }
-    }
+/// The hint for a word in the place of a command.
+fn command_hint(command: &Command, word: &str) -> Option<String> {
     if let Some(kind) = FileKind::at(Path::new(word))
-        && is_first
+        && command.get_name() == "blindgrasp"
     {
         return Some(format!("the command is missing before {}: it is {}", quote(word), kind.description()));
     }

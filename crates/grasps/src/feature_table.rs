@@ -29,10 +29,8 @@ pub struct FeatureTable {
 pub enum FeatureTableError {
     #[error(transparent)]
     Dataset(#[from] DatasetError),
-    #[error("cannot write the table: {0}")]
+    #[error(transparent)]
     Csv(#[from] csv::Error),
-    #[error("cannot write the table: {0}")]
-    Io(#[from] std::io::Error),
 }
 
 /// Writes a row (CSV) for each grasp with a label and a contact, of the recordings whose index `is_own`. A row has where the
@@ -83,7 +81,7 @@ pub fn write_feature_table(
         readings.push(of_rows);
     }
     check_classes(objects.iter().map(|(object, class)| (object.as_str(), class.as_str())))?;
-    table.flush()?;
+    table.flush().map_err(csv::Error::from)?;
     Ok(FeatureTable { readings, n_excluded })
 }
 
@@ -111,7 +109,7 @@ pub fn merge_feature_rows(
             Err(reason) => *n_excluded.entry(reason.into()).or_default() += 1,
         }
     }
-    table.flush()?;
+    table.flush().map_err(csv::Error::from)?;
     Ok(FeatureTable { readings: vec![of_rows], n_excluded })
 }
 

@@ -7,7 +7,7 @@ use serde::Serialize;
 
 use crate::dataset::{DatasetError, label_of, reported_truth};
 use blindgrasp_messages::{GraspTruth, Phase, TactileFrame};
-use blindgrasp_recording::{IndexedTopic, Problem, Problems, Record, RecordingIndex, RecordingReader};
+use blindgrasp_recording::{IndexedTopic, Problem, Problems, Record, RecordingError, RecordingIndex, RecordingReader};
 use blindgrasp_stages::contacts::contacts_from_frame;
 use blindgrasp_stages::hand::Hand;
 use blindgrasp_stages::label::Label;
@@ -17,7 +17,7 @@ use blindgrasp_stages::label::Label;
 pub struct Overview {
     pub hand: String,
     pub made_by: BTreeSet<String>,
-    pub n_recordings: usize,
+    pub recordings: Vec<String>,
     /// Whether the recordings were read whole.
     pub is_full: bool,
     /// `None` if an index does not say.
@@ -96,10 +96,15 @@ struct Sums {
 }
 
 impl Overview {
-    /// The sums over indexes, with the hand and the metadata of the first.
-    pub fn of(indexes: Vec<RecordingIndex>) -> Self {
-        let mut overview = Overview { n_recordings: indexes.len(), duration_secs: Some(0.0), ..Overview::default() };
-        for (idx, index) in indexes.into_iter().enumerate() {
+    /// The sums over recordings, with the hand and the metadata of the first.
+    ///
+    /// # Errors
+    /// A recording has no index that can be read.
+    pub fn of(recordings: &[PathBuf]) -> Result<Self, RecordingError> {
+        let mut overview = Overview { duration_secs: Some(0.0), ..Overview::default() };
+        for (idx, path) in recordings.iter().enumerate() {
+            let index = RecordingIndex::open(path)?;
+            overview.recordings.push(path.display().to_string());
             let secs = index.duration_nanos().map(|nanos| nanos as f64 / 1e9);
             overview.duration_secs = overview.duration_secs.zip(secs).map(|(sum, more)| sum + more);
             overview.n_file_bytes += index.n_file_bytes;
@@ -124,7 +129,7 @@ impl Overview {
                 }
             }
         }
-        overview
+        Ok(overview)
     }
 }
 

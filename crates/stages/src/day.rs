@@ -23,15 +23,18 @@ pub const MIN_NOVELTY_GRASPS: u64 = 10;
 /// The greatest number that a day is given by; names of days have greater ones.
 pub const MAX_DAY: u32 = 999_999_999;
 
-/// The number of a day. Dates (2026-11-24, 20261124) and whole numbers from 1 to [`MAX_DAY`] are their digits. Any other name
-/// has a number above that is made of its SHA-256, so that it is the same in all recordings.
+/// The number of a day. Dates (20261124; 2026-11-24, also with a time) and whole numbers from 1 to [`MAX_DAY`] (also 3.0, as pandas
+/// writes them) are their digits. Any other name has a number above, made of its SHA-256, which is the same in all recordings.
 pub fn day_number(name: &str) -> u32 {
-    let digits: String = name.trim().split('-').collect();
+    let name = name.trim();
+    let is_time = matches!(name.as_bytes(), [_, _, _, _, b'-', _, _, b'-', _, _, b' ' | b'T', ..]);
+    let name = if is_time { &name[..10] } else { name };
+    let digits: String = name.strip_suffix(".0").unwrap_or(name).split('-').collect();
     let is_number = digits.len() <= 9 && digits.bytes().all(|byte| byte.is_ascii_digit());
     match digits.parse() {
         Ok(day @ 1..=MAX_DAY) if is_number => day,
         _ => {
-            let digest = Sha256::digest(name.trim());
+            let digest = Sha256::digest(name);
             let first = digest.iter().take(4).fold(0, |sum, byte| (sum << 8) | u32::from(*byte));
             MAX_DAY + 1 + first % 3_000_000_000
         }
@@ -364,10 +367,14 @@ mod tests {
 
     #[test]
     fn dates_and_numbers_are_their_own_days() {
-        for (name, day) in [("2026-11-24", 20_261_124), (" 20261124 ", 20_261_124), ("3", 3), ("999999999", MAX_DAY)] {
+        for (name, day) in [(" 20261124 ", 20_261_124), ("3", 3), ("3.0", 3), ("999999999", MAX_DAY)] {
             assert_eq!(day_number(name), day);
         }
-        let named = ["palm down", "palm 45", "0", "", "-", "+3", "1000000000", "0000000000001"].map(day_number);
+        for name in ["2026-11-24", "2026-11-24 10:00:01.5", "2026-11-24T00:00:00.000000000", "20261124.0"] {
+            assert_eq!(day_number(name), 20_261_124, "{name}");
+        }
+        let named = ["palm down", "palm 45", "0", ".0.0", "2026-1-4 x", "", "-", "+3", "1000000000", "0000000000001"]
+            .map(day_number);
         let distinct: std::collections::BTreeSet<u32> = named.into_iter().collect();
         assert!(named.iter().all(|day| *day > MAX_DAY) && distinct.len() == named.len(), "{named:?}");
     }

@@ -65,7 +65,7 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "COLUMN")]
     class: Option<String>,
     /// The day on which the table was recorded, a date or a name: its grasps have one baseline (train --day-baseline).
-    #[arg(long, value_name = "NAME", conflicts_with = "day_column")]
+    #[arg(long, value_name = "NAME", conflicts_with = "day_column", value_parser = clap::builder::NonEmptyStringValueParser::new())]
     day: Option<String>,
     /// Column of the recording day, a date or a name in each row.
     #[arg(long, value_name = "COLUMN")]

@@ -83,7 +83,8 @@ fn info_adds_up_and_agrees_with_the_simulations_report() {
     arguments.push("--json");
     let report = json_of(&arguments);
     let info = json_of(&["info", &data, "--json"]);
-    assert_eq!((&info["n_grasps"], &info["n_with_truth"], &info["n_recordings"]), (&63.into(), &63.into(), &5.into()));
+    assert_eq!((&info["n_grasps"], &info["n_with_truth"]), (&63.into(), &63.into()));
+    assert_eq!(info["recordings"].as_array().map(Vec::len), Some(5));
     assert_eq!(info["n_stable"], report["n_stable"]);
     assert_eq!(info["n_stable"], 30, "0.48 of 63, rounded");
     // Of the simulator's active cells some feel another link: they are no contacts.

@@ -98,8 +98,8 @@ pub fn import_frames(
     })
 }
 
-/// Writes the labels and the outcomes of grasps whose first frames have these headers. Returns which lifts held,
-/// and how many labels and outcomes are of none of them.
+/// Writes the labels and the outcomes of grasps whose first frames have these headers. Returns which lifts held (of
+/// two, a drop counts), and how many labels and outcomes are of none of them.
 fn write_known(
     recording: &mut RecordingWriter,
     hand: &Hand,
@@ -131,7 +131,7 @@ fn write_known(
             continue;
         }
         if message.lifted {
-            outcomes.insert(key, message.held);
+            *outcomes.entry(key).or_insert(true) &= message.held;
         }
         let header = Header { hand_id: hand.id(), ..*header };
         recording.write(LiftOutcome::TOPIC, &Stamped { header, message: message.clone() })?;
