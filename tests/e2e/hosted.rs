@@ -90,6 +90,20 @@ fn a_python_stage_without_output_has_optional_inputs_counts_params_and_a_state()
 }
 
 #[test]
+fn the_end_of_a_recording_waits_as_long_as_samples_are_answered() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let watch =
+        "args: [watch], params: {told: 'yes'}, inputs: {prediction: classifier/prediction, feature: encoder/feature}";
+    let node = format!("operators:\n  watch: {{run: {}, {watch}}}\n", role(folder.path()).display());
+    let flow = dataflow(folder.path(), &[("operators:\n", &node)]);
+    let graph = Graph::start(
+        &flow,
+        &["--set", "recorded_source.to_s=8", "--set", "recorded_source.rate=max", "--grace", "0.3"],
+    );
+    assert_whole(&graph.finish(), "a reader that is half a second behind");
+}
+
+#[test]
 fn a_python_source_with_feedback_is_killed_without_a_loss() {
     let folder = tempfile::tempdir().expect("a folder");
     let replace = crate::python::with_source(folder.path(), "device");

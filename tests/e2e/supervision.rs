@@ -235,11 +235,8 @@ fn an_operator_that_ignores_sigterm_is_killed_after_the_grace_period() {
             Graph::start(&dataflow_with(folder.path(), &[wrapper]), &[&FAST_FOREVER[..], &["--grace", "0.7"]].concat());
         let ended = graph.stop();
         assert_eq!(ended.code, Some(1), "{node}: {}", ended.stderr);
-        assert!(
-            ended.stderr.contains(&format!("node '{node}' did not drain within 0.7 s")),
-            "{node}: {}",
-            ended.stderr
-        );
+        let told = format!("node '{node}' did not drain within 0.7 s");
+        assert!(ended.stderr.contains(&told), "{node}: {}", ended.stderr);
     }
 }
 

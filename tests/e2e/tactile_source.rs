@@ -283,11 +283,8 @@ fn outcomes_of_lifts_withdraw_a_promise_that_they_refute() {
     let counts = json!({"lifts/kept": 0, "lifts/dropped": 4, "lifts/unreported": 0, "promise_withdrawn": 1,
         "promise/kept": 0, "promise/dropped": 4, "promise/drops_at_most_ppm": 1_000_000, "promise/lifts_per_object": 5});
     wait_until(|| graph.node("lift_arbiter")["counts"] == counts, || graph.node("lift_arbiter").to_string());
-    assert!(
-        graph.said().contains("more lifts drop the object than the promised 5 %: 4 of 4 that were reported"),
-        "{}",
-        graph.said()
-    );
+    let told = "more lifts drop the object than the promised 5 %: 4 of 4 that were reported";
+    assert!(graph.said().contains(told), "{}", graph.said());
     (0..3).for_each(|_| graph.kill("lift_arbiter"));
     tell(n_before..n_before + 4);
     wait_until(|| graph.n_decisions() == n_before + 4, || graph.said());
