@@ -376,7 +376,7 @@ def _named(path: Path) -> Iterator[None]:
     except OSError as error:
         if error.filename is not None:
             raise
-        raise OSError(error.errno, error.strerror, fspath(path)) from error
+        raise OSError(error.errno, error.strerror or str(error), fspath(path)) from error
 
 
 def _write(path: Path, schema: Any, tables: Iterator[Any]) -> None:

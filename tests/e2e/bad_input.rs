@@ -139,7 +139,6 @@ fn usage() {
         2,
         &["tip: a parameter of an operator is given by --set", "Usage: blindgrasp run [OPTIONS]"],
     );
-    check(&["topic", "list"], 2, &["tip: use 'blindgrasp ps'"]);
     check(&[], 2, &["Usage"]);
     for operator in ["recorded_source", "contacts", "encoder", "classifier", "lift_arbiter"] {
         check(&["operator", operator], 2, &["--describe"]);
