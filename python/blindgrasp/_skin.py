@@ -137,14 +137,15 @@ class Skin:
         """The forces on the cells, newtons: what `read` gives without any of the options but the bell's."""
         places, n_cells = self._places, len(self.names)
         places.check(data.model)
-        if not data.ncon:
-            return np.zeros(n_cells)
         contact = data.contact
+        parts = places.part_of_geom.take(contact.geom, mode="wrap")
+        if parts.max(initial=-1) < 0:
+            return np.zeros(n_cells)
         # The solver leaves some contacts out. The rows of the others follow each other, up to the last row.
         first = contact.efc_address
         used = (first >= 0).nonzero()[0]
         newtons = places.newtons(first.take(used), data.efc_force)
-        parts = places.part_of_geom.take(contact.geom.take(used, 0), mode="wrap")
+        parts = parts.take(used, 0)
         at, side = ((parts >= 0) & (newtons > 0.0)[:, None]).nonzero()
         if not len(at):
             return np.zeros(n_cells)
