@@ -73,9 +73,7 @@ impl LinkBook {
 
     /// Whether a sample may still come to a node from a machine that is there.
     pub(super) fn may_feed(&self, node: &Node) -> bool {
-        let Some(local) = &self.local else {
-            return false;
-        };
+        let Some(local) = &self.local else { return false };
         node.inputs.iter().any(|input| {
             let port = format!("{}/{}", input.from_node, input.from_port);
             // A graph that is stopped does not wait for the sources of other machines to end, but for its own link.
@@ -95,7 +93,9 @@ impl LinkBook {
         with_port.any(|peer| match peer.state {
             PeerState::Up => true,
             PeerState::Down => peer.silent_millis.is_some_and(|silent| silent < AWAY_MILLIS),
-            PeerState::Waiting | PeerState::Left | PeerState::Refused => false,
+            // A link that was started again has not found it yet.
+            PeerState::Waiting => peer.n_times_up > 0,
+            PeerState::Left | PeerState::Refused => false,
         })
     }
 }
