@@ -52,7 +52,7 @@ def from_table(
     hand's cells read counts). `joint_columns` are those of its joints, in radians, or metres of a joint that slides;
     `joints` is one posture for all grasps in their place. `label` is the column that says how the grasp ended:
     `stable_value` is one of its two values. `group` is the column of the object, `class_column` of its class, `day` and
-    `day_column` name the session, and `phase_column` the phase of a frame. `frames` is how often the reading of a grasp
+    `day_column` name the session (a time is of its date), and `phase_column` the phase of a frame. `frames` is how often the reading of a grasp
     that is one row is repeated (3). docs/learning.md has the rules.
 
     Raises ProgramError if the program refuses the table; line 2 in its text is the first row. Warns of what it warns of.
@@ -109,7 +109,7 @@ def _write(table: Any, path: Path) -> None:
 
 def _text(value: object) -> str:
     # A cell of MATLAB or HDF5 is an array of one value, and a text may be bytes.
-    if getattr(value, "size", 0) == 1 and hasattr(value, "ndim") and value.ndim:
+    if getattr(value, "ndim", 0) and value.size == 1:
         value = value.item()
     if getattr(value, "ndim", 0) or isinstance(value, (list, tuple, dict)):
         raise TypeError(f"expected one value in each column of a row, found {value!r}")

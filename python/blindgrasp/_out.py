@@ -70,6 +70,7 @@ def to_parquet(
     `grasp` (its running number in the file), `seq`, `stamp_nanos`, `phase` and `predicted` (the probability that the
     graph predicted of the frame); then `joint_0`, …, `cell_0`, … (with `hand`, as in `Recording.to_frame`,
     `cell_palm_0`) and the other senses. Unknown values are missing. `from_parquet` reads it back.
+    `overwrite` replaces a file that is there.
 
     Raises ModuleNotFoundError without pyarrow, FileExistsError if the file exists, ValueError if it is one of the recordings,
     if they are of different hands or one is given twice, and ProgramError if a folder is not whole.

@@ -373,7 +373,7 @@ class Recordings(Folder):
         with self.assertRaisesRegex(blindgrasp.ProgramError, "there is no recording in this folder"):
             blindgrasp.to_parquet(self.folder, self.folder / "frames.parquet")
         self.assertEqual(list(self.folder.iterdir()), [])
-        # A folder is what it is to the commands.
+        # A folder with a compressed recording is refused, as by the commands.
         copied = self.folder / "one.mcap"
         copied.write_bytes(ORDINARY.read_bytes())
         compressed = self.folder / "two.mcap.zstd"

@@ -27,7 +27,7 @@ pub const MAX_DAY: u32 = 999_999_999;
 /// writes them) are their digits. Any other name has a number above, made of its SHA-256, which is the same in all recordings.
 pub fn day_number(name: &str) -> u32 {
     let name = name.trim();
-    let is_time = matches!(name.as_bytes(), [_, _, _, _, b'-', _, _, b'-', _, _, b' ' | b'T', ..]);
+    let is_time = matches!(name.as_bytes(), [_, _, _, _, b'-', _, _, b'-', _, _, b' ' | b'T', _, _, b':', ..]);
     let name = if is_time { &name[..10] } else { name };
     let digits: String = name.strip_suffix(".0").unwrap_or(name).split('-').collect();
     let is_number = digits.len() <= 9 && digits.bytes().all(|byte| byte.is_ascii_digit());
@@ -373,8 +373,8 @@ mod tests {
         for name in ["2026-11-24", "2026-11-24 10:00:01.5", "2026-11-24T00:00:00.000000000", "20261124.0"] {
             assert_eq!(day_number(name), 20_261_124, "{name}");
         }
-        let named = ["palm down", "palm 45", "0", ".0.0", "2026-1-4 x", "", "-", "+3", "1000000000", "0000000000001"]
-            .map(day_number);
+        assert!(day_number("2026-11-24 evening") > MAX_DAY);
+        let named = ["palm down", "palm 45", "0", ".0.0", "", "-", "+3", "1000000000", "0000000000001"].map(day_number);
         let distinct: std::collections::BTreeSet<u32> = named.into_iter().collect();
         assert!(named.iter().all(|day| *day > MAX_DAY) && distinct.len() == named.len(), "{named:?}");
     }

@@ -17,7 +17,7 @@ pub(super) enum Ending {
     /// It goes on.
     #[default]
     NotBegun,
-    /// The node of this index is asked to drain, and has answered so far. The deadline is set once no swap is under way.
+    /// The node of this index is asked to drain, and has answered the samples up to `answered`. The deadline is set once no swap is under way.
     Draining {
         idx: usize,
         deadline: Option<Duration>,
@@ -74,8 +74,7 @@ impl<S: Surroundings> Lifecycle<S> {
                 return true;
             }
             let last = self.last_answered(idx);
-            let is_stopped = self.is_asked_to_stop || self.link.was_stopped;
-            let goes_on = answered.is_some() && last != answered && !is_stopped;
+            let goes_on = answered.is_some() && last != answered && !self.is_asked_to_stop && !self.link.was_stopped;
             let deadline = match deadline {
                 Some(deadline) if !goes_on => deadline,
                 _ => self.now + self.options.grace,

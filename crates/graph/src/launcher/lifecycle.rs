@@ -499,11 +499,11 @@ impl<S: Surroundings> Lifecycle<S> {
                     member.counts.extend(counts);
                 }
             }
+            Report::Counts { counts, in_all: false } if !is_active => instance.counts = counts,
             Report::Counts { counts, in_all: false } => {
                 for (name, count) in &counts {
                     let before = instance.counts.get(name).copied().unwrap_or(0);
-                    let more = if is_active { count.saturating_sub(before) } else { 0 };
-                    *member.counts.entry(name.clone()).or_default() += more;
+                    *member.counts.entry(name.clone()).or_default() += count.saturating_sub(before);
                 }
                 instance.counts = counts;
             }

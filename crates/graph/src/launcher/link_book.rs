@@ -93,8 +93,7 @@ impl LinkBook {
         with_port.any(|peer| match peer.state {
             PeerState::Up => true,
             PeerState::Down => peer.silent_millis.is_some_and(|silent| silent < AWAY_MILLIS),
-            // A link that was started again has not found it yet.
-            PeerState::Waiting => peer.n_times_up > 0,
+            PeerState::Waiting => peer.n_times_up > 0, // A link that was started again looks for it.
             PeerState::Left | PeerState::Refused => false,
         })
     }

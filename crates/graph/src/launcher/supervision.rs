@@ -82,7 +82,7 @@ impl<S: Surroundings> Lifecycle<S> {
             self.kill(active.id, Some("was stopped from outside (SIGTERM)".into()));
         }
         let Some(active) = &self.members[idx].active else { return };
-        // Not if its process is started again for another node of its group.
+        // Its process is started again for another node of its group, and cannot do without it.
         let is_needed = self.together(idx).iter().any(|mate| self.members[*mate].restart_at.is_some());
         let has_done_its_work = active.is_asked && active.is_done && !is_needed;
         if !active.is_running() && !has_done_its_work {
